@@ -1,0 +1,1 @@
+"""Hardware-in-the-loop CAN drive controller with a fixed-time disturbance observer."""

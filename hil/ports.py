@@ -1,0 +1,60 @@
+"""What the loop needs of the world, as protocols: a drive, a clock, a recorder.
+
+The loop knows these and nothing behind them; the composition root hands in what implements them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from hil.signals import TickArray
+
+
+class Drive(Protocol):
+    """A drive on a bus. ``tick`` is one record of :data:`hil.signals.TICK`, filled in place."""
+
+    def sync(self) -> None:
+        """Send SYNC: the drive latches the newest command, samples and answers with its feedback."""
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        """Drain the bus until this tick's feedback came or ``deadline_ns`` (monotonic) passed.
+
+        Fills ``rx_flags`` and, for what arrived whole and valid, the measurement fields. A field that
+        did not arrive keeps its previous value.
+        """
+
+    def send(self, tick: Any) -> None:
+        """Encode and send the tick's command. Raises on what can't be encoded."""
+
+    def stop(self) -> None:
+        """Send zero voltage and disable, best effort, repeated; never raises."""
+
+    def close(self) -> None:
+        """Release the bus."""
+
+
+class Clock(Protocol):
+    """Monotonic integer nanoseconds, and the only way to wait."""
+
+    def now_ns(self) -> int:
+        """Return the time of this clock in nanoseconds."""
+
+    def sleep_until(self, deadline_ns: int) -> int:
+        """Wait until the deadline and return the time of waking."""
+
+
+class Recorder(Protocol):
+    """Takes records without ever blocking; drops are counted."""
+
+    @property
+    def failed(self) -> bool:
+        """True once the writer has reported that it can't write (disk full, killed)."""
+
+    def tick(self, tick: TickArray) -> None:
+        """Store one tick record."""
+
+    def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
+        """Store one raw CAN frame."""
+
+    def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
+        """Store one event."""

@@ -1,0 +1,211 @@
+"""What flows through a tick and is logged: one fixed-size record whose bytes are a protobuf message.
+
+Each field of :data:`TICK` is preceded by its protobuf tag, so a record needs no encoding: its raw
+bytes are a valid message of the schema that :mod:`hil.log` embeds in the file. Fields are fixed-width
+only. Field numbers are part of the file format and never reused. Units are SI; ``dq`` quantities are
+amplitude-invariant; ``w`` is the mechanical speed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Kind = Literal["f8", "u8", "i8", "u4", "i4"]
+Role = Literal["time", "input", "output"]
+TickArray = npt.NDArray[np.void]
+"""A one-element (or longer) structured array of dtype :data:`TICK`."""
+
+_WIRE_TYPE: Final[dict[str, int]] = {"f8": 1, "u8": 1, "i8": 1, "u4": 5, "i4": 5}
+
+
+class DriveState(IntEnum):
+    """States of CiA 402, used by the drive and, under the same names, by the supervisor."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+
+class Controlword(IntEnum):
+    """CiA 402 controlwords that the supervisor sends."""
+
+    DISABLE_VOLTAGE = 0x0000
+    QUICK_STOP = 0x0002
+    SHUTDOWN = 0x0006
+    SWITCH_ON = 0x0007
+    ENABLE_OPERATION = 0x000F
+    FAULT_RESET = 0x0080
+
+
+class Request(IntEnum):
+    """What the operator (or the end of the run) asks of the supervisor; an input of the tick."""
+
+    NONE = 0
+    ARM = 1
+    RUN = 2
+    STOP = 3
+    QUICK_STOP = 4
+
+
+class RxFlag(IntEnum):
+    """Bits of what was seen on the bus while waiting for this tick's feedback (IntEnum: numba knows it)."""
+
+    FRESH = 1 << 0
+    CRC_ERROR = 1 << 1
+    COUNTER_REPEATED = 1 << 2
+    COUNTER_JUMP = 1 << 3
+    LENGTH_ERROR = 1 << 4
+    STATUS = 1 << 5
+    EMERGENCY = 1 << 6
+    ERROR_FRAME = 1 << 7
+    BUS_DOWN = 1 << 8
+    FOREIGN_COMMAND = 1 << 9
+    SEND_FAILED = 1 << 10
+
+
+class Reason(IntEnum):
+    """Why the supervisor left normal operation, or the guard changed a command. 0 is no reason."""
+
+    NONE = 0
+    STOP_REQUESTED = 1
+    QUICK_STOP_REQUESTED = 2
+    STALE_FEEDBACK = 3
+    NOT_A_NUMBER = 4
+    CRC_ERRORS = 5
+    COUNTER_ERRORS = 6
+    OVER_SPEED = 7
+    OVER_CURRENT = 8
+    OVER_TEMPERATURE = 9
+    DC_LINK_UNDER_VOLTAGE = 10
+    DC_LINK_OVER_VOLTAGE = 11
+    DRIVE_FAULT = 12
+    DRIVE_LEFT_OPERATION = 13
+    ENABLE_TIMEOUT = 14
+    BUS_DOWN = 15
+    SEND_FAILED = 16
+    FOREIGN_COMMAND = 17
+    LOG_FAILED = 18
+    GUARD_PERSISTENT = 19
+    LOOP_OVERRUN = 20
+    CONTROLLER_ERROR = 21
+    I2T = 22
+    ENERGY = 23
+
+
+class GuardFlag(IntEnum):
+    """Bits of what the guard changed in this tick's command."""
+
+    NOT_A_NUMBER = 1 << 0
+    VOLTAGE = 1 << 1
+    VOLTAGE_STEP = 1 << 2
+    LOAD_TORQUE = 1 << 3
+    STATE_FORCES_ZERO = 1 << 4
+    SOFT_START = 1 << 5
+    DENORMAL = 1 << 6
+    APPLIED_DEVIATES = 1 << 7
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of the tick record: protobuf number, name, kind, unit, role and meaning."""
+
+    number: int
+    name: str
+    kind: Kind
+    unit: str
+    role: Role
+    doc: str
+
+
+FIELDS: Final[tuple[Field, ...]] = (
+    Field(1, "k", "u8", "", "time", "tick index"),
+    Field(2, "t_ns", "i8", "ns", "time", "deadline of the tick on the loop's clock"),
+    Field(3, "lateness_ns", "i4", "ns", "time", "wake-up after the deadline"),
+    Field(4, "received_ns", "i4", "ns", "time", "feedback complete, after the deadline"),
+    Field(5, "computed_ns", "i4", "ns", "time", "control law done, after the deadline"),
+    Field(6, "sent_ns", "i4", "ns", "time", "command handed to the bus, after the deadline"),
+    Field(7, "skipped", "u4", "", "time", "whole periods skipped before this tick"),
+    Field(8, "recorded_ns", "i4", "ns", "time", "previous tick's record stored, after that tick's deadline"),
+    Field(16, "rx_flags", "u4", "", "input", "RxFlag bits"),
+    Field(17, "gap", "u4", "", "input", "periods since the previous tick (1 unless periods were skipped)"),
+    Field(18, "w", "f8", "rad/s", "input", "measured mechanical speed"),
+    Field(19, "i_q", "f8", "A", "input", "measured q current"),
+    Field(20, "i_d", "f8", "A", "input", "measured d current"),
+    Field(21, "echo", "u4", "", "input", "counter of the command the drive applies from now on"),
+    Field(22, "drive_state", "u4", "", "input", "DriveState of the drive"),
+    Field(23, "limited", "u4", "", "input", "1 when the drive limited the voltage"),
+    Field(24, "v_dc", "f8", "V", "input", "DC-link voltage of the newest status frame, NaN before it"),
+    Field(25, "temperature_motor", "f8", "degC", "input", "motor temperature of the newest status frame"),
+    Field(26, "temperature_inverter", "f8", "degC", "input", "inverter temperature, newest status frame"),
+    Field(27, "drive_error", "u4", "", "input", "CiA 301/402 error code of the drive, 0 for none"),
+    Field(28, "w_ref", "f8", "rad/s", "input", "reference speed"),
+    Field(29, "dw_ref", "f8", "rad/s2", "input", "its derivative"),
+    Field(30, "request", "u4", "", "input", "Request of the operator"),
+    Field(31, "log_failed", "u4", "", "input", "1 when the writer reported a failure"),
+    Field(32, "T_L_true", "f8", "N m", "input", "true load torque when the drive is an emulator, else NaN"),
+    Field(33, "i_q_ref_in", "f8", "A", "input", "reference q current (controller fac), else 0"),
+    Field(48, "state", "u4", "", "output", "DriveState of the supervisor"),
+    Field(49, "reason", "u4", "", "output", "Reason that latched, 0 while none"),
+    Field(50, "guard_flags", "u4", "", "output", "GuardFlag bits"),
+    Field(51, "controlword", "u4", "", "output", "CiA 402 controlword sent"),
+    Field(52, "counter", "u4", "", "output", "counter of the command sent"),
+    Field(53, "send", "u4", "", "output", "1 when a command goes out this tick"),
+    Field(54, "filled", "u4", "", "output", "observer memory filled with measurements, ticks"),
+    Field(55, "ua_q", "f8", "V", "output", "q voltage applied over the past period"),
+    Field(56, "ua_d", "f8", "V", "output", "d voltage applied over the past period"),
+    Field(57, "d_hat_w", "f8", "rad/s2", "output", "estimated disturbance of the speed channel"),
+    Field(58, "d_hat_q", "f8", "A/s", "output", "estimated disturbance of the q current channel"),
+    Field(59, "d_hat_d", "f8", "A/s", "output", "estimated disturbance of the d current channel"),
+    Field(60, "i_q_ref", "f8", "A", "output", "q current asked by the speed law, after its limit"),
+    Field(61, "u_q_law", "f8", "V", "output", "q voltage asked by the control law"),
+    Field(62, "u_d_law", "f8", "V", "output", "d voltage asked by the control law"),
+    Field(63, "T_L_law", "f8", "N m", "output", "load torque asked by the control law (fac), else 0"),
+    Field(64, "u_q", "f8", "V", "output", "q voltage sent: guarded and rounded to the wire"),
+    Field(65, "u_d", "f8", "V", "output", "d voltage sent"),
+    Field(66, "T_L", "f8", "N m", "output", "load torque sent (fac), else 0"),
+    Field(67, "T_L_hat", "f8", "N m", "output", "load torque estimate -J d_hat_w"),
+)
+
+
+def _tag(field: Field) -> bytes:
+    """Protobuf tag of a field: varint of (number << 3 | wire type)."""
+    value = field.number << 3 | _WIRE_TYPE[field.kind]
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+    return bytes(out)
+
+
+def _dtype() -> np.dtype[np.void]:
+    """Packed layout: for each field its tag bytes, then its little-endian value."""
+    parts: list[tuple[str, str]] = []
+    for field in FIELDS:
+        parts += [(f"_{field.number}", f"S{len(_tag(field))}"), (field.name, f"<{field.kind}")]
+    return np.dtype(parts)
+
+
+TICK: Final[np.dtype[np.void]] = _dtype()
+INPUTS: Final = tuple(f.name for f in FIELDS if f.role == "input")
+OUTPUTS: Final = tuple(f.name for f in FIELDS if f.role == "output")
+
+
+def new_ticks(count: int = 1) -> TickArray:
+    """Return ``count`` zeroed tick records with their protobuf tags in place."""
+    ticks = np.zeros(count, TICK)
+    for field in FIELDS:
+        ticks[f"_{field.number}"] = _tag(field)
+    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
+        ticks[name] = np.nan
+    return ticks
