@@ -1,0 +1,364 @@
+"""Run configuration: typed, frozen, refuses unknown keys, names every mistake at once.
+
+Units stand in the key names (``rate_hz``, ``i_max_a``). Paths are relative to the file they stand in.
+What the values mean physically is left to the modules that use them.
+"""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
+from pydantic import field_validator, model_validator
+
+from hil.errors import ConfigError
+
+Model = TypeVar("Model", bound=BaseModel)
+MAX_CONFIG_BYTES = 1 << 20
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Table(BaseModel):
+    """Base of all tables: frozen, unknown keys refused, no silent conversion of strings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file of at most 1 MiB. Raises ConfigError with the file's name and the line."""
+    try:
+        if path.stat().st_size > MAX_CONFIG_BYTES:
+            raise ConfigError(str(path), [f"larger than {MAX_CONFIG_BYTES} bytes; this is no configuration"])
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(str(path), [f"can't be read: {error.strerror or error}"]) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(str(path), [f"is not TOML: {error}"]) from error
+
+
+def included(value: Any, info: ValidationInfo) -> Any:
+    """A table may be given inline or as the path of a TOML file that holds it."""
+    if not isinstance(value, str):
+        return value
+    base = (info.context or {}).get("base", Path())
+    try:
+        return read_toml(base / value)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+
+
+class MotorTable(Table):
+    """Parameters of a PMSM: what the controller believes. Amplitude-invariant dq, mechanical speed."""
+
+    name: str = ""
+    R_s_ohm: Positive
+    L_d_h: Positive
+    L_q_h: Positive
+    psi_f_wb: Positive
+    n_p: Annotated[int, Field(ge=1, le=100)]
+    J_kg_m2: Positive
+    B_f_n_m_s: NonNegative = 0.0
+
+
+class LoopTable(Table):
+    """Rate, pacing and clock of the loop."""
+
+    rate_hz: Annotated[int, Field(ge=10, le=20_000)] = 1000
+    pacing: Literal["sync", "feedback", "timer"] = "sync"
+    clock: Literal["realtime", "lockstep"] = "realtime"
+    duration_s: Positive | None = None
+    feedback_timeout_us: Annotated[int, Field(ge=10)] | None = None
+    max_gap_ticks: Annotated[int, Field(ge=1, le=64)] = 20
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _whole_nanoseconds(cls, value: int) -> int:
+        if 1_000_000_000 % value:
+            raise ValueError(f"{value} Hz has no whole number of nanoseconds; take one that divides 1e9")
+        return value
+
+    @property
+    def period_ns(self) -> int:
+        """T_s in nanoseconds."""
+        return 1_000_000_000 // self.rate_hz
+
+    @property
+    def timeout_ns(self) -> int:
+        """How long after its deadline a tick waits for feedback (default 0.6 T_s)."""
+        return self.feedback_timeout_us * 1000 if self.feedback_timeout_us else self.period_ns * 6 // 10
+
+
+class RealtimeTable(Table):
+    """What is asked of the operating system; what it does not grant is said, not assumed."""
+
+    fifo_priority: Annotated[int, Field(ge=0, le=98)] = 50
+    cpu: Annotated[int, Field(ge=0)] | None = None
+    lock_memory: bool = True
+
+
+class BusTable(Table):
+    """The CAN bus, in python-can's terms."""
+
+    interface: str = "hil-local"
+    channel: str = "demo"
+    bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = None
+    fd: bool = False
+
+
+class DriveTable(Table):
+    """The drive: its DBC and node."""
+
+    dbc: str
+    node_id: Annotated[int, Field(ge=1, le=127)] = 1
+    heartbeat_timeout_s: Positive = 3.0
+
+
+class ChannelTable(Table):
+    """One channel's window: FTDOB with two poles and a delay D, or a conventional DOB with one pole."""
+
+    kind: Literal["ftdob", "dob"] = "ftdob"
+    gamma_1_rad_s: Positive
+    gamma_2_rad_s: Positive | None = None
+    delay_ms: Positive | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> ChannelTable:
+        if self.kind == "ftdob" and (self.gamma_2_rad_s is None or self.delay_ms is None):
+            raise ValueError("an ftdob channel needs gamma_2_rad_s and delay_ms")
+        return self
+
+
+class ObserverTable(Table):
+    """The disturbance observer of the speed channel and of both current channels."""
+
+    speed: ChannelTable
+    current: ChannelTable
+
+
+class ControllerTable(Table):
+    """Poles of the composite law; gains are derived from them (Theorem 2)."""
+
+    kind: Literal["cascade", "fac"] = "cascade"
+    speed_pole_rad_s: Positive = 30.0
+    current_pole_rad_s: Positive = 250.0
+    current_d_pole_rad_s: Positive | None = None
+    compensate_coupling: bool = True
+
+
+class LimitsTable(Table):
+    """What must never be exceeded. There are no defaults for the first five: a user decides them."""
+
+    w_max_rad_s: Positive
+    i_max_a: Positive
+    i_trip_a: Positive
+    u_max_v: Positive
+    du_max_v: Positive
+    T_L_max_n_m: NonNegative = 0.0
+    v_dc_min_v: NonNegative = 0.0
+    v_dc_max_v: Positive = 1e4
+    temperature_max_c: Finite = 120.0
+    i_continuous_a: Positive | None = None
+    i2t_max_a2s: Positive | None = None
+    power_window_s: Positive = 1.0
+    energy_max_j: Positive | None = None
+    applied_deviation_max_v: Positive | None = None
+    trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
+    guard_trip_ticks: Annotated[int, Field(ge=1)] = 200
+    soft_start_s: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> LimitsTable:
+        if self.i_trip_a <= self.i_max_a:
+            raise ValueError("i_trip_a must be above i_max_a, or normal operation trips")
+        if self.v_dc_max_v <= self.v_dc_min_v:
+            raise ValueError("v_dc_max_v must be above v_dc_min_v")
+        return self
+
+
+class FeedbackTable(Table):
+    """What to do when feedback is missing or damaged: hold, then quick stop, then fault."""
+
+    hold_ticks: Annotated[int, Field(ge=0, le=1000)] = 3
+    quick_stop_ticks: Annotated[int, Field(ge=1, le=10_000)] = 20
+    error_budget: Annotated[int, Field(ge=1, le=10_000)] = 8
+    enable_timeout_s: Positive = 2.0
+
+
+class StepReference(Table):
+    """w* jumps from 0 to ``w_rad_s`` at ``at_s``."""
+
+    kind: Literal["step"]
+    w_rad_s: Finite
+    at_s: NonNegative = 0.0
+    i_q_a: Finite = 0.0
+
+
+class RampReference(Table):
+    """w* ramps to ``w_rad_s`` with ``rate_rad_s2``, and back to 0 from ``down_at_s`` on."""
+
+    kind: Literal["ramp"]
+    w_rad_s: Finite
+    rate_rad_s2: Positive
+    at_s: NonNegative = 0.0
+    down_at_s: Positive | None = None
+    i_q_a: Finite = 0.0
+
+
+class SCurveReference(Table):
+    """Jerk-limited ramp to ``w_rad_s``, and back to 0 from ``down_at_s`` on."""
+
+    kind: Literal["s-curve"]
+    w_rad_s: Finite
+    rate_rad_s2: Positive
+    jerk_rad_s3: Positive
+    at_s: NonNegative = 0.0
+    down_at_s: Positive | None = None
+    i_q_a: Finite = 0.0
+
+
+class SineReference(Table):
+    """w* = offset + amplitude sin(2 pi f t)."""
+
+    kind: Literal["sine"]
+    offset_rad_s: Finite = 0.0
+    amplitude_rad_s: Finite
+    frequency_hz: Positive
+    i_q_a: Finite = 0.0
+
+
+class TableReference(Table):
+    """Piecewise linear through (t, w) points."""
+
+    kind: Literal["table"]
+    t_s: Annotated[list[Finite], Field(min_length=2, max_length=256)]
+    w_rad_s: Annotated[list[Finite], Field(min_length=2, max_length=256)]
+    i_q_a: Finite = 0.0
+
+    @model_validator(mode="after")
+    def _matching(self) -> TableReference:
+        if len(self.t_s) != len(self.w_rad_s):
+            raise ValueError("t_s and w_rad_s must have the same length")
+        if any(b <= a for a, b in zip(self.t_s, self.t_s[1:], strict=False)):
+            raise ValueError("t_s must increase")
+        return self
+
+
+ReferenceTable = Annotated[
+    StepReference | RampReference | SCurveReference | SineReference | TableReference,
+    Field(discriminator="kind"),
+]
+
+
+class LogTable(Table):
+    """Where the log goes."""
+
+    folder: str = "../logs"
+    name: str | None = None
+    frames: bool = True
+
+
+class EmulatorTable(Table):
+    """The emulated drive that belongs to this run; its parameters are in its own file."""
+
+    plant: str
+
+
+class RunConfig(Table):
+    """Everything a run needs."""
+
+    loop: LoopTable = LoopTable()
+    realtime: RealtimeTable = RealtimeTable()
+    bus: BusTable = BusTable()
+    drive: DriveTable
+    motor: Annotated[MotorTable, BeforeValidator(included)]
+    controller: ControllerTable = ControllerTable()
+    observer: ObserverTable
+    limits: LimitsTable
+    feedback: FeedbackTable = FeedbackTable()
+    reference: ReferenceTable
+    log: LogTable = LogTable()
+    emulator: EmulatorTable | None = None
+
+
+def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> Model:
+    """Load and validate ``path`` as ``model``; ``overrides`` are ``table.key=value`` in TOML syntax.
+
+    Raises :class:`hil.errors.ConfigError` that names every mistake, with a suggestion for unknown keys.
+    """
+    data = read_toml(path)
+    for override in overrides:
+        _apply_override(data, override)
+    return validate(data, model, str(path), path.parent)
+
+
+def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path) -> Model:
+    """Validate ``data`` as ``model``; ``base`` is the folder that paths are relative to."""
+    try:
+        return model.model_validate(data, context={"base": base})
+    except ValidationError as error:
+        problems = [_describe(problem, model) for problem in error.errors()]
+        raise ConfigError(where, problems) from None
+
+
+def _apply_override(data: dict[str, Any], override: str) -> None:
+    """Set one ``table.key=value``; a value that is not TOML is taken as a string."""
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError("--set", [f"{override!r} is not of the form table.key=value"])
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    *tables, last = key.strip().split(".")
+    for name in tables:
+        data = data.setdefault(name, {})
+        if not isinstance(data, dict):
+            raise ConfigError("--set", [f"{override!r}: {name} is not a table"])
+    data[last] = value
+
+
+def _describe(problem: Any, model: type[BaseModel]) -> str:
+    """One line for one pydantic problem: key path, what is wrong, what to do."""
+    path = ".".join(str(part) for part in problem["loc"])
+    if problem["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(problem["loc"][-1]), _keys_at(model, problem["loc"][:-1]), n=1)
+        return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "; remove it")
+    if problem["type"] == "missing":
+        return f"{path}: missing; add it"
+    text = problem["msg"].removeprefix("Value error, ")
+    text = text[:1].lower() + text[1:]
+    given = problem.get("input")
+    return f"{path}: {text}" + (f", not {given!r}" if isinstance(given, (int, float, str)) else "")
+
+
+def _keys_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
+    """Keys of the table at ``loc``; for a union of tables, of all its members that the tag names."""
+    models: list[type[BaseModel]] = [model]
+    for part in loc:
+        found = [m for owner in models if part in owner.model_fields
+                 for m in _models_in(owner.model_fields[part].annotation)]
+        models = found or [m for m in models if part in _tags(m)] or models
+    return [key for m in models for key in m.model_fields]
+
+
+def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is not None:
+        return [m for a in typing.get_args(annotation) for m in _models_in(a)]
+    return []
+
+
+def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
+    kind = model.model_fields.get("kind")
+    return typing.get_args(kind.annotation) if kind else ()

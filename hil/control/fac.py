@@ -1,0 +1,86 @@
+"""The fully actuated model x' = A x + B u + d and its exact sampled form for an input held over a tick.
+
+Source: the paper's eq. (1); the sampled form is exact for d constant over a tick.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from hil.control.errors import ControlDesignError
+from hil.control.linalg import Array
+
+MAX_GAP = 64
+"""Longest gap in the measurements [ticks] that a gap inverse is kept for."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampledModel:
+    """Exact sampled form x_{k+1} = Ad x_k + Bd u_k + Ed d_k.
+
+    ``A`` (n, n), ``B`` (n, m), ``T_s`` [s]; ``Ad = e^{A T_s}``, ``Ed = int_0^{T_s} e^{A s} ds``,
+    ``Bd = Ed B``; ``gap_inverse[m - 1] = (sum_{j<m} Ad^j Ed)^-1`` for gaps of m ticks, so
+    ``gap_inverse[0] = Ed^-1``.
+    """
+
+    A: Array
+    B: Array
+    T_s: float
+    Ad: Array
+    Ed: Array
+    Bd: Array
+    gap_inverse: Array
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+
+def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledModel:
+    """Sample x' = A x + B u + d exactly with the matrix exponential of [[A, I], [0, 0]] T_s.
+
+    Raises ControlDesignError for shapes that do not fit, a T_s that is not positive, and a singular
+    gap sum (A then has eigenvalues 2 pi j / (m T_s) apart; take another T_s).
+    """
+    A, B = np.array(A, float), np.array(B, float)
+    n = A.shape[0] if A.ndim == 2 else 0
+    if A.ndim != 2 or A.shape != (n, n) or B.ndim != 2 or B.shape[0] != n:
+        raise ControlDesignError(f"A must be n x n and B n x m, not {A.shape} and {B.shape}")
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        raise ControlDesignError("A and B must be finite")
+    if not T_s > 0:
+        raise ControlDesignError(f"T_s must be positive, not {T_s}")
+    augmented = np.zeros((2 * n, 2 * n))
+    augmented[:n, :n], augmented[:n, n:] = A, np.eye(n)
+    exponential = expm(augmented * T_s)
+    Ad, Ed = exponential[:n, :n], exponential[:n, n:]
+    return SampledModel(A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), _gap_inverses(Ad, Ed, max_gap))
+
+
+def _gap_inverses(Ad: Array, Ed: Array, max_gap: int) -> Array:
+    """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap; shape (max_gap, n, n)."""
+    n = Ad.shape[0]
+    inverses = np.empty((max_gap, n, n))
+    power, total = np.eye(n), np.zeros((n, n))
+    for m in range(max_gap):
+        total = total + power @ Ed
+        power = power @ Ad
+        scale = float(np.abs(total).max())
+        if not np.isfinite(scale) or np.linalg.cond(total) > 1e13:
+            if m == 0:
+                raise ControlDesignError("Ed is singular: A has eigenvalues 2 pi j / T_s apart; change T_s")
+            inverses[m:] = np.nan
+            break
+        inverses[m] = np.linalg.inv(total)
+    return _frozen(inverses)
+
+
+def _frozen(array: Array) -> Array:
+    """A contiguous array that can't be written to."""
+    out = np.ascontiguousarray(array)
+    out.flags.writeable = False
+    return out

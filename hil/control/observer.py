@@ -1,0 +1,189 @@
+"""Disturbance observers: FTDOB (Theorem 1) and the conventional DOB (31), in exact sampled form.
+
+Both share the innovation v_k = Ed^-1 (x_k - Ad x_{k-1} - Bd ua_{k-1}), which equals d_{k-1} exactly, and
+differ in the window that they put over it. The small interface of a window: a design that yields
+:class:`Window` (what every window has: two poles per channel, a length N, weights Theta), one step kernel,
+and :func:`impulse_response` for its bounds. A conventional DOB is the window with one pole, Theta = (1, 0)
+and no delayed term, so both run through one kernel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hil.control.errors import ControlDesignError
+from hil.control.jit import jit
+from hil.control.linalg import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Weights of a window, one entry (or pair) per channel; n channels.
+
+    ``lam`` (2, n): lam_i = e^{-gamma_i T_s}; ``lam_N`` (2, n): lam_i^N, 0 for a filter without a window;
+    ``theta`` (2, n); ``N`` (n,) window length in ticks (for a conventional DOB: 1).
+    """
+
+    lam: Array
+    lam_N: Array
+    theta: Array
+    N: np.ndarray[tuple[int], np.dtype[np.int64]]
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return int(self.lam.shape[1])
+
+
+def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) -> Window:
+    """FTDOB of Theorem 1: Theta = [I 0] [G, Lam^N G]^-1, N = round(D / T_s), per channel.
+
+    gamma_1, gamma_2 [rad/s] (n,), delay D [s] scalar or (n,). With diagonal Gamma the inverse is, per channel,
+    theta_1 = -lam_2^N / (lam_1^N - lam_2^N), theta_2 = lam_1^N / (lam_1^N - lam_2^N).
+    Raises ControlDesignError that names the violated condition.
+    """
+    gamma = np.array([gamma_1, gamma_2], float).reshape(2, -1)
+    n = gamma.shape[1]
+    delay = np.broadcast_to(np.asarray(delay_s, float), (n,))
+    if not (np.isfinite(gamma).all() and (gamma > 0).all()):
+        raise ControlDesignError(f"Gamma must be a positive diagonal matrix (Theorem 1, 1), not {gamma.ravel()}")
+    if (delay < T_s * 0.999999).any() or not np.isfinite(delay).all():
+        raise ControlDesignError(f"D = {delay.min()} s is shorter than a tick, T_s = {T_s} s; lengthen D")
+    if (gamma[0] == gamma[1]).any():
+        channel = int(np.argmax(gamma[0] == gamma[1]))
+        raise ControlDesignError(
+            f"equal poles in channel {channel}: gamma_1 = gamma_2 = {gamma[0, channel]} rad/s makes "
+            "[G, Lam^N G] singular (Theorem 1, 2); move one of them"
+        )
+    N = np.rint(delay / T_s).astype(np.int64)
+    lam = np.exp(-gamma * T_s)
+    lam_N = lam**N
+    determinant = lam_N[1] - lam_N[0]
+    if (np.abs(determinant) < 1e-9).any():
+        channel = int(np.argmin(np.abs(determinant)))
+        raise ControlDesignError(
+            f"[G, Lam^N G] is singular in channel {channel} to working precision: |lam_1^N - lam_2^N| = "
+            f"{abs(determinant[channel]):.1e} (Theorem 1, 2); move the poles apart or change D"
+        )
+    return Window(lam, lam_N, np.array([lam_N[1] / determinant, -lam_N[0] / determinant]), N)
+
+
+def conventional_dob(gamma_c: Array, T_s: float) -> Window:
+    """Conventional DOB (31): d_hat = h, h_k = lam h_{k-1} + (1 - lam) v_k; gamma_c [rad/s] (n,)."""
+    gamma = np.atleast_1d(np.asarray(gamma_c, float))
+    if not (np.isfinite(gamma).all() and (gamma > 0).all()):
+        raise ControlDesignError(f"Gamma_c must be positive, not {gamma}")
+    lam = np.exp(-gamma * T_s)
+    zero = np.zeros_like(lam)
+    return Window(
+        np.array([lam, lam]),
+        np.array([zero, zero]),
+        np.array([np.ones_like(lam), zero]),
+        np.ones(lam.shape[0], np.int64),
+    )
+
+
+def side_by_side(*windows: Window) -> Window:
+    """One window whose channels are those of ``windows`` in turn."""
+    return Window(
+        np.concatenate([w.lam for w in windows], axis=1),
+        np.concatenate([w.lam_N for w in windows], axis=1),
+        np.concatenate([w.theta for w in windows], axis=1),
+        np.concatenate([w.N for w in windows]),
+    )
+
+
+@jit
+def window_step(
+    lam: Array,
+    lam_N: Array,
+    theta: Array,
+    N: Array,
+    v: Array,
+    h: Array,
+    past: Array,
+    head: int,
+    d_hat: Array,
+) -> int:
+    """Advance h by one tick with innovation v (n,) and write d_hat (n,); return the new head.
+
+    h_i <- lam_i h_i + (1 - lam_i) v;  d_hat = sum_i theta_i (h_{i,k} - lam_i^N h_{i,k-N})
+    ``h`` (2, n) is h_{k-1}; ``past`` (size, 2, n) is a ring of its past values, head points at h_{k-1}.
+    """
+    size = past.shape[0]
+    new_head = (head + 1) % size
+    for c in range(v.shape[0]):
+        back = (new_head - N[c]) % size
+        total = 0.0
+        for i in range(2):
+            value = lam[i, c] * h[i, c] + (1.0 - lam[i, c]) * v[c]
+            total += theta[i, c] * (value - lam_N[i, c] * past[back, i, c])
+            h[i, c] = value
+        d_hat[c] = total
+    for c in range(v.shape[0]):
+        for i in range(2):
+            past[new_head, i, c] = h[i, c]
+    return new_head
+
+
+@jit
+def fill(v: Array, h: Array, past: Array) -> None:
+    """Fill the memory with the steady state of a disturbance v: h_i = v now and in the past."""
+    for c in range(v.shape[0]):
+        for i in range(2):
+            h[i, c] = v[c]
+            for j in range(past.shape[0]):
+                past[j, i, c] = v[c]
+
+
+def impulse_response(window: Window, length: int) -> Array:
+    """Response of d_hat to a unit impulse of v, per channel; shape (length, n).
+
+    w_j = sum_i theta_i (1 - lam_i) lam_i^j for j < N, 0 from N on (a conventional DOB goes on).
+    """
+    j = np.arange(length)[:, None]
+    weights = np.zeros((length, window.n))
+    for i in range(2):
+        infinite = (1 - window.lam[i]) * window.lam[i] ** j
+        shifted = np.where(j >= window.N, window.lam_N[i] * (1 - window.lam[i]), 0.0)
+        weights += window.theta[i] * (infinite - shifted * window.lam[i] ** np.maximum(j - window.N, 0))
+    return weights
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a window's estimate can reach, per channel (n,).
+
+    ``ramp``: error per unit slope of d [s] (sup|d'| times it bounds the error; int phi of the errata);
+    ``noise``: sigma(d_hat) / sigma(x) for white noise on x [1/s];
+    ``resolution``: largest error for one LSB q of each state, rounding errors +-q/2 of the worst signs.
+    """
+
+    ramp: Array
+    noise: Array
+    resolution: Array
+
+
+def bounds(window: Window, Ad: Array, Ed: Array, T_s: float, lsb: Array, length: int = 4096) -> Bounds:
+    """Bounds of a window on the sampled model; lsb (n,) is the resolution of x on the wire.
+
+    x with error e_k gives v the error Ed^-1 (e_k - Ad e_{k-1}); through the window w the error of d_hat is
+    sum_j (w_j Ed^-1 - w_{j-1} Ed^-1 Ad) e_{k-j}, whose worst case over |e| <= lsb/2 is its absolute sum.
+    """
+    weights = impulse_response(window, length)
+    inverse = np.linalg.inv(Ed)
+    shifted = np.vstack([np.zeros((1, window.n)), weights[:-1]])
+    response = weights[:, :, None] * inverse[None] - shifted[:, :, None] * (inverse @ Ad)[None]
+    remaining = np.abs(weights.sum(axis=0) - np.cumsum(weights, axis=0))
+    return Bounds(
+        ramp=(remaining.sum(axis=0) + 0.5) * T_s,
+        noise=np.sqrt((response**2).sum(axis=(0, 2))),
+        resolution=(np.abs(response) * (np.asarray(lsb, float) / 2)[None, None, :]).sum(axis=(0, 2)),
+    )
+
+
+def rule_of_thumb(lsb: float, delay_s: float) -> float:
+    """One LSB q in x is about 1.4 q / D in d_hat."""
+    return 1.4 * lsb / delay_s

@@ -1,0 +1,231 @@
+"""The guard: what stands between any control law and the bus. Pure, small, knows no control law.
+
+It judges measurements (:func:`judge_measurement`) and changes commands (:func:`guard_command`). A single
+excess is saturated and marked in ``guard_flags``; one that persists trips. Its state and limits are two
+fixed-shape records, so that loop, replay and simulation run the same compiled code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from hil.control.jit import jit
+from hil.signals import DriveState, GuardFlag, Reason, RxFlag
+
+SAFETY_PARAMS: Final = np.dtype(
+    [
+        ("T_s", "f8"),
+        ("w_max", "f8"),
+        ("i_trip", "f8"),
+        ("u_max", "f8"),
+        ("du_max", "f8"),
+        ("T_L_max", "f8"),
+        ("v_dc_min", "f8"),
+        ("v_dc_max", "f8"),
+        ("temperature_max", "f8"),
+        ("i_continuous", "f8"),
+        ("i2t_max", "f8"),
+        ("power_window", "f8"),
+        ("energy_max", "f8"),
+        ("deviation_max", "f8"),
+        ("soft_start_ticks", "i8"),
+        ("trip_ticks", "i8"),
+        ("guard_trip_ticks", "i8"),
+        ("hold_ticks", "i8"),
+        ("quick_stop_ticks", "i8"),
+        ("error_budget", "i8"),
+        ("enable_ticks", "i8"),
+        ("max_gap", "i8"),
+        ("counter_modulus", "i8"),
+        ("u_lsb", "f8"),
+        ("T_L_lsb", "f8"),
+        ("J", "f8"),
+    ],
+    align=True,
+)
+"""Limits, times in ticks, and the resolution of the command on the wire. Units as in the config."""
+
+SAFETY_STATE: Final = np.dtype(
+    [
+        ("state", "i8"),
+        ("reason", "i8"),
+        ("armed_ticks", "i8"),
+        ("run_ticks", "i8"),
+        ("stop_ticks", "i8"),
+        ("stale", "i8"),
+        ("crc_level", "i8"),
+        ("counter_level", "i8"),
+        ("over", "i8", 8),
+        ("clamped", "i8"),
+        ("deviating", "i8"),
+        ("i2t", "f8"),
+        ("energy", "f8"),
+        ("u_q", "f8"),
+        ("u_d", "f8"),
+        ("T_L", "f8"),
+        ("counter", "i8"),
+        ("sent_q", "f8", 256),
+        ("sent_d", "f8", 256),
+        ("sent_T", "f8", 256),
+        ("ua_q", "f8"),
+        ("ua_d", "f8"),
+        ("ua_T", "f8"),
+    ],
+    align=True,
+)
+"""State of supervisor and guard: CiA 402 state, latched reason, counters, window sums, sent commands."""
+
+OVER_SPEED: Final = 0
+OVER_CURRENT: Final = 1
+OVER_TEMPERATURE: Final = 2
+UNDER_VOLTAGE: Final = 3
+OVER_VOLTAGE: Final = 4
+
+
+@jit
+def persists(s: Any, index: int, exceeded: bool, ticks: int) -> bool:
+    """True once ``exceeded`` has held for ``ticks`` consecutive ticks; the count is ``s['over'][index]``."""
+    over = s["over"]
+    over[index] = over[index] + 1 if exceeded else 0
+    return bool(over[index] >= ticks)
+
+
+@jit
+def windows_trip(p: Any, s: Any, t: Any) -> int:
+    """Advance i2t [A2 s] and the leaky energy window [J]; return the Reason that they trip with.
+
+    i2t:    s += (i^2 - i_continuous^2) T_s, not below 0
+    energy: e += 1.5 (u_q i_q + u_d i_d) T_s - e T_s / window
+    """
+    i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
+    s["i2t"] = max(0.0, s["i2t"] + (i_squared - p["i_continuous"] * p["i_continuous"]) * p["T_s"])
+    power = 1.5 * (s["ua_q"] * t["i_q"] + s["ua_d"] * t["i_d"])
+    s["energy"] = s["energy"] + power * p["T_s"] - s["energy"] * p["T_s"] / p["power_window"]
+    if s["i2t"] > p["i2t_max"]:
+        return int(Reason.I2T)
+    if abs(s["energy"]) > p["energy_max"]:
+        return int(Reason.ENERGY)
+    return int(Reason.NONE)
+
+
+@jit
+def judge_measurement(p: Any, s: Any, t: Any) -> int:
+    """Return the Reason to stop that a fresh measurement gives, 0 for none.
+
+    NaN and infinity stop at once; speed, current, temperature and DC link after ``trip_ticks``.
+    """
+    if not (math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])):
+        return int(Reason.NOT_A_NUMBER)
+    ticks = p["trip_ticks"]
+    i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
+    temperature = max(t["temperature_motor"], t["temperature_inverter"])
+    speed = persists(s, OVER_SPEED, abs(t["w"]) > p["w_max"], ticks)
+    current = persists(s, OVER_CURRENT, i_squared > p["i_trip"] * p["i_trip"], ticks)
+    hot = persists(s, OVER_TEMPERATURE, temperature > p["temperature_max"], ticks)
+    low = persists(s, UNDER_VOLTAGE, t["v_dc"] < p["v_dc_min"], ticks)
+    high = persists(s, OVER_VOLTAGE, t["v_dc"] > p["v_dc_max"], ticks)
+    if speed:
+        return int(Reason.OVER_SPEED)
+    if current:
+        return int(Reason.OVER_CURRENT)
+    if hot:
+        return int(Reason.OVER_TEMPERATURE)
+    if low:
+        return int(Reason.DC_LINK_UNDER_VOLTAGE)
+    if high:
+        return int(Reason.DC_LINK_OVER_VOLTAGE)
+    return int(windows_trip(p, s, t))
+
+
+@jit
+def limit_step(value: float, previous: float, step: float) -> float:
+    """Limit the change from ``previous`` to ``step`` per tick."""
+    return min(max(value, previous - step), previous + step)
+
+
+@jit
+def to_wire(value: float, lsb: float) -> float:
+    """Round to the resolution of the wire, as encoder and decoder do: rint(value / lsb) lsb."""
+    return np.rint(value / lsb) * lsb
+
+
+@jit
+def is_denormal(value: float) -> bool:
+    """True for a number other than 0 below the smallest normal float64."""
+    return value != 0.0 and abs(value) < 2.2250738585072014e-308
+
+
+@jit
+def voltage_limit(p: Any, s: Any) -> float:
+    """Radius of the voltage circle [V], ramped in over the soft start."""
+    if s["run_ticks"] >= p["soft_start_ticks"]:
+        return float(p["u_max"])
+    return float(p["u_max"]) * float(s["run_ticks"]) / float(p["soft_start_ticks"])
+
+
+@jit
+def deviates(p: Any, s: Any, t: Any) -> bool:
+    """True when the drive applies another voltage than the last one sent, by more than allowed."""
+    dq = s["ua_q"] - s["u_q"]
+    dd = s["ua_d"] - s["u_d"]
+    far = dq * dq + dd * dd > p["deviation_max"] * p["deviation_max"]
+    return bool(far and t["rx_flags"] & RxFlag.FRESH)
+
+
+@jit
+def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) -> int:
+    """Limit the law's command, write what may be sent to the tick, return the Reason of a persistent excess.
+
+    Order: not a number -> 0; state -> 0; circle u_max (with soft start); step du_max; load torque; wire.
+    """
+    flags = 0
+    if not (math.isfinite(u_q) and math.isfinite(u_d) and math.isfinite(T_L)):
+        u_q, u_d, T_L = 0.0, 0.0, 0.0
+        flags |= int(GuardFlag.NOT_A_NUMBER)
+    if is_denormal(u_q) or is_denormal(u_d) or is_denormal(T_L):
+        u_q = 0.0 if is_denormal(u_q) else u_q
+        u_d = 0.0 if is_denormal(u_d) else u_d
+        T_L = 0.0 if is_denormal(T_L) else T_L
+        flags |= int(GuardFlag.DENORMAL)
+    if t["state"] != DriveState.OPERATION_ENABLED:
+        flags |= int(GuardFlag.STATE_FORCES_ZERO) if (u_q != 0.0 or u_d != 0.0 or T_L != 0.0) else 0
+        return write_command(s, t, 0.0, 0.0, 0.0, flags)
+    limit = voltage_limit(p, s)
+    norm = math.sqrt(u_q * u_q + u_d * u_d)
+    if norm > limit:
+        u_q, u_d = u_q * limit / norm, u_d * limit / norm
+        flags |= int(GuardFlag.SOFT_START) if limit < p["u_max"] else int(GuardFlag.VOLTAGE)
+    step_q, step_d = limit_step(u_q, s["u_q"], p["du_max"]), limit_step(u_d, s["u_d"], p["du_max"])
+    flags |= int(GuardFlag.VOLTAGE_STEP) if (step_q != u_q or step_d != u_d) else 0
+    load = min(max(T_L, -p["T_L_max"]), p["T_L_max"])
+    flags |= int(GuardFlag.LOAD_TORQUE) if load != T_L else 0
+    flags |= int(GuardFlag.APPLIED_DEVIATES) if deviates(p, s, t) else 0
+    write_command(
+        s, t, to_wire(step_q, p["u_lsb"]), to_wire(step_d, p["u_lsb"]), to_wire(load, p["T_L_lsb"]), flags
+    )
+    return persistent_excess(p, s, flags)
+
+
+@jit
+def write_command(s: Any, t: Any, u_q: float, u_d: float, T_L: float, flags: int) -> int:
+    """Store the guarded command in tick and state."""
+    t["u_q"], t["u_d"], t["T_L"] = u_q, u_d, T_L
+    s["u_q"], s["u_d"], s["T_L"] = u_q, u_d, T_L
+    t["guard_flags"] = flags
+    return int(Reason.NONE)
+
+
+@jit
+def persistent_excess(p: Any, s: Any, flags: int) -> int:
+    """Return GUARD_PERSISTENT once the guard has had to change the command for guard_trip_ticks in a row.
+
+    The soft start is a planned limit and does not count; a command that is not a number counts at once.
+    """
+    changed = flags & ~(int(GuardFlag.SOFT_START) | int(GuardFlag.DENORMAL))
+    s["clamped"] = s["clamped"] + 1 if changed else 0
+    if flags & int(GuardFlag.NOT_A_NUMBER):
+        return int(Reason.CONTROLLER_ERROR)
+    return int(Reason.GUARD_PERSISTENT) if s["clamped"] >= p["guard_trip_ticks"] else int(Reason.NONE)

@@ -1,0 +1,221 @@
+"""The supervisor: one pure transition function by CiA 402 names, with the reason of each stop.
+
+A stop latches: no path leads from a stop back to operation; a new arming is a new run. What may be sent in
+a state is decided here, how large it may be in :mod:`hil.guard`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hil.control.jit import jit
+from hil.guard import judge_measurement
+from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
+
+STOP_TICKS = 20
+"""Ticks for which the stop frames are repeated before the run ends."""
+
+
+@jit
+def leaky(level: int, error: bool) -> int:
+    """Error level: +4 for an error, -1 for a good tick, not below 0."""
+    return level + 4 if error else max(0, level - 1)
+
+
+@jit
+def judge_bus(p: Any, s: Any, t: Any) -> int:
+    """Return the Reason to stop that this tick's traffic gives, 0 for none."""
+    flags = t["rx_flags"]
+    s["crc_level"] = leaky(s["crc_level"], (flags & (RxFlag.CRC_ERROR | RxFlag.LENGTH_ERROR)) != 0)
+    s["counter_level"] = leaky(
+        s["counter_level"], (flags & (RxFlag.COUNTER_REPEATED | RxFlag.COUNTER_JUMP)) != 0
+    )
+    if flags & RxFlag.BUS_DOWN:
+        return int(Reason.BUS_DOWN)
+    if flags & RxFlag.SEND_FAILED:
+        return int(Reason.SEND_FAILED)
+    if flags & RxFlag.FOREIGN_COMMAND:
+        return int(Reason.FOREIGN_COMMAND)
+    if s["crc_level"] > 4 * p["error_budget"]:
+        return int(Reason.CRC_ERRORS)
+    if s["counter_level"] > 4 * p["error_budget"]:
+        return int(Reason.COUNTER_ERRORS)
+    return int(Reason.NONE)
+
+
+@jit
+def judge_drive(s: Any, t: Any) -> int:
+    """Return the Reason to stop that the drive's own state gives, 0 for none."""
+    if not t["rx_flags"] & RxFlag.FRESH:
+        return int(Reason.NONE)
+    if t["drive_state"] == DriveState.FAULT or t["drive_state"] == DriveState.FAULT_REACTION_ACTIVE:
+        return int(Reason.DRIVE_FAULT)
+    if t["drive_state"] != DriveState.OPERATION_ENABLED:
+        return int(Reason.DRIVE_LEFT_OPERATION)
+    return int(Reason.NONE)
+
+
+@jit
+def judge_timing(p: Any, s: Any, t: Any) -> int:
+    """Count ticks without fresh feedback; return the Reason once the hold time is over."""
+    if t["rx_flags"] & RxFlag.FRESH:
+        s["stale"] = 0
+    else:
+        s["stale"] += t["gap"]
+    if s["stale"] > p["hold_ticks"]:
+        return int(Reason.STALE_FEEDBACK)
+    if t["gap"] > p["max_gap"]:
+        return int(Reason.LOOP_OVERRUN)
+    return int(Reason.NONE)
+
+
+@jit
+def first(a: int, b: int) -> int:
+    """Return the first reason that is one."""
+    return a if a != 0 else b
+
+
+@jit
+def judge(p: Any, s: Any, t: Any) -> int:
+    """Return the most telling Reason to stop now, 0 for none. All judges run, so that all counts advance."""
+    bus = judge_bus(p, s, t)
+    timing = judge_timing(p, s, t)
+    measured = int(Reason.NONE)
+    if t["rx_flags"] & RxFlag.FRESH:
+        measured = judge_measurement(p, s, t)
+    reason = first(bus, measured)
+    if s["state"] == DriveState.OPERATION_ENABLED:
+        reason = first(reason, judge_drive(s, t))
+    reason = first(reason, timing)
+    reason = first(reason, int(Reason.LOG_FAILED) if t["log_failed"] else 0)
+    return first(reason, judge_request(t))
+
+
+@jit
+def judge_request(t: Any) -> int:
+    """Return the Reason that the operator's request gives."""
+    if t["request"] == Request.QUICK_STOP:
+        return int(Reason.QUICK_STOP_REQUESTED)
+    if t["request"] == Request.STOP:
+        return int(Reason.STOP_REQUESTED)
+    return int(Reason.NONE)
+
+
+@jit
+def is_fault(reason: int) -> bool:
+    """True for reasons that are faults; a requested stop and stale feedback begin as a quick stop."""
+    return not (
+        reason == Reason.STOP_REQUESTED
+        or reason == Reason.QUICK_STOP_REQUESTED
+        or reason == Reason.STALE_FEEDBACK
+        or reason == Reason.LOG_FAILED
+    )
+
+
+@jit
+def begin_stop(s: Any, reason: int) -> None:
+    """Latch the reason and enter the stop that belongs to it."""
+    s["reason"] = reason
+    s["stop_ticks"] = 0
+    fault = is_fault(reason)
+    s["state"] = int(DriveState.FAULT_REACTION_ACTIVE) if fault else int(DriveState.QUICK_STOP_ACTIVE)
+
+
+@jit
+def handshake(p: Any, s: Any, t: Any) -> int:
+    """Follow the drive through its enable handshake; return the controlword for its state.
+
+    A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words.
+    """
+    if t["rx_flags"] & RxFlag.FRESH:
+        if t["drive_state"] == DriveState.OPERATION_ENABLED:
+            s["state"] = int(DriveState.OPERATION_ENABLED)
+            s["run_ticks"] = 0
+            return int(Controlword.ENABLE_OPERATION)
+        if t["drive_state"] == DriveState.SWITCHED_ON:
+            s["state"] = int(DriveState.SWITCHED_ON)
+            return int(Controlword.ENABLE_OPERATION)
+        if t["drive_state"] == DriveState.READY_TO_SWITCH_ON:
+            return int(Controlword.SWITCH_ON)
+        if t["drive_state"] == DriveState.FAULT:
+            odd = s["armed_ticks"] % 2 == 1
+            return int(Controlword.FAULT_RESET) if odd else int(Controlword.DISABLE_VOLTAGE)
+    return int(Controlword.SHUTDOWN)
+
+
+@jit
+def arming(p: Any, s: Any, t: Any) -> int:
+    """One tick of READY_TO_SWITCH_ON or SWITCHED_ON: handshake, or the Reason to give up."""
+    s["armed_ticks"] += 1
+    reason = judge_arming(p, s, t)
+    if reason != 0:
+        begin_stop(s, reason)
+        return int(Controlword.DISABLE_VOLTAGE)
+    return int(handshake(p, s, t))
+
+
+@jit
+def judge_arming(p: Any, s: Any, t: Any) -> int:
+    """While the drive is being enabled, missing feedback is covered by the enable timeout."""
+    reason = judge_bus(p, s, t)
+    if t["rx_flags"] & RxFlag.FRESH:
+        reason = first(reason, judge_measurement(p, s, t))
+    reason = first(reason, int(Reason.LOG_FAILED) if t["log_failed"] else 0)
+    reason = first(reason, judge_request(t))
+    timed_out = s["armed_ticks"] > p["enable_ticks"]
+    return first(reason, int(Reason.ENABLE_TIMEOUT) if timed_out else 0)
+
+
+@jit
+def operate(p: Any, s: Any, t: Any) -> int:
+    """One tick of OPERATION_ENABLED."""
+    reason = judge(p, s, t)
+    if reason != 0:
+        begin_stop(s, reason)
+        return int(Controlword.QUICK_STOP)
+    s["run_ticks"] += 1
+    return int(Controlword.ENABLE_OPERATION)
+
+
+@jit
+def stopping(p: Any, s: Any, t: Any) -> int:
+    """One tick of a stop: zero voltage and quick stop until the drive has left operation, then disable."""
+    s["stop_ticks"] += 1
+    judge_timing(p, s, t)
+    if s["state"] == DriveState.QUICK_STOP_ACTIVE and s["stale"] > p["quick_stop_ticks"]:
+        s["state"] = int(DriveState.FAULT_REACTION_ACTIVE)
+    fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
+    left = fresh and t["drive_state"] != DriveState.OPERATION_ENABLED
+    if (left and s["stop_ticks"] >= 3) or s["stop_ticks"] >= STOP_TICKS + p["quick_stop_ticks"]:
+        quick = s["state"] == DriveState.QUICK_STOP_ACTIVE
+        s["state"] = int(DriveState.SWITCH_ON_DISABLED) if quick else int(DriveState.FAULT)
+        return int(Controlword.DISABLE_VOLTAGE)
+    return int(Controlword.QUICK_STOP)
+
+
+@jit
+def supervise(p: Any, s: Any, t: Any) -> None:
+    """Advance the supervisor by one tick; writes ``state``, ``reason``, ``controlword`` and ``send``.
+
+    SWITCH_ON_DISABLED (disarmed) --ARM--> READY_TO_SWITCH_ON -> SWITCHED_ON -> OPERATION_ENABLED
+    -> QUICK_STOP_ACTIVE -> SWITCH_ON_DISABLED, or -> FAULT_REACTION_ACTIVE -> FAULT. Disarmed and after a
+    stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down nothing is sent.
+    """
+    state = s["state"]
+    controlword = int(Controlword.DISABLE_VOLTAGE)
+    send = 1
+    if state == DriveState.SWITCH_ON_DISABLED and s["reason"] == 0 and t["request"] == Request.ARM:
+        s["state"] = int(DriveState.READY_TO_SWITCH_ON)
+        controlword = arming(p, s, t)
+    elif state == DriveState.READY_TO_SWITCH_ON or state == DriveState.SWITCHED_ON:
+        controlword = arming(p, s, t)
+    elif state == DriveState.OPERATION_ENABLED:
+        controlword = operate(p, s, t)
+    elif state == DriveState.QUICK_STOP_ACTIVE or state == DriveState.FAULT_REACTION_ACTIVE:
+        controlword = stopping(p, s, t)
+    else:
+        send = 0
+    t["state"] = s["state"]
+    t["reason"] = s["reason"]
+    t["controlword"] = controlword
+    t["send"] = 0 if (t["rx_flags"] & RxFlag.BUS_DOWN or s["reason"] == Reason.BUS_DOWN) else send
