@@ -10,7 +10,7 @@ import difflib
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -47,13 +47,19 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 def included(value: Any, info: ValidationInfo) -> Any:
     """A table may be given inline or as the path of a TOML file that holds it."""
-    if not isinstance(value, str):
-        return value
-    base = (info.context or {}).get("base", Path())
-    try:
-        return read_toml(base / value)
-    except ConfigError as error:
-        raise ValueError(str(error)) from error
+    return info.context["include"](value) if isinstance(value, str) and info.context else value
+
+
+def _includer(base: Path) -> Callable[[str], dict[str, Any]]:
+    """Return what reads a TOML file relative to ``base``."""
+
+    def include(name: str) -> dict[str, Any]:
+        try:
+            return read_toml(base / name)
+        except ConfigError as error:
+            raise ValueError(str(error)) from error
+
+    return include
 
 
 class MotorTable(Table):
@@ -304,7 +310,7 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
 def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path) -> Model:
     """Validate ``data`` as ``model``; ``base`` is the folder that paths are relative to."""
     try:
-        return model.model_validate(data, context={"base": base})
+        return model.model_validate(data, context={"include": _includer(base)})
     except ValidationError as error:
         problems = [_describe(problem, model) for problem in error.errors()]
         raise ConfigError(where, problems) from None

@@ -105,10 +105,10 @@ def windows_trip(p: Any, s: Any, t: Any) -> int:
     power = 1.5 * (s["ua_q"] * t["i_q"] + s["ua_d"] * t["i_d"])
     s["energy"] = s["energy"] + power * p["T_s"] - s["energy"] * p["T_s"] / p["power_window"]
     if s["i2t"] > p["i2t_max"]:
-        return int(Reason.I2T)
+        return Reason.I2T.value
     if abs(s["energy"]) > p["energy_max"]:
-        return int(Reason.ENERGY)
-    return int(Reason.NONE)
+        return Reason.ENERGY.value
+    return Reason.NONE.value
 
 
 @jit
@@ -118,7 +118,7 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
     NaN and infinity stop at once; speed, current, temperature and DC link after ``trip_ticks``.
     """
     if not (math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])):
-        return int(Reason.NOT_A_NUMBER)
+        return Reason.NOT_A_NUMBER.value
     ticks = p["trip_ticks"]
     i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
     temperature = max(t["temperature_motor"], t["temperature_inverter"])
@@ -128,15 +128,15 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
     low = persists(s, UNDER_VOLTAGE, t["v_dc"] < p["v_dc_min"], ticks)
     high = persists(s, OVER_VOLTAGE, t["v_dc"] > p["v_dc_max"], ticks)
     if speed:
-        return int(Reason.OVER_SPEED)
+        return Reason.OVER_SPEED.value
     if current:
-        return int(Reason.OVER_CURRENT)
+        return Reason.OVER_CURRENT.value
     if hot:
-        return int(Reason.OVER_TEMPERATURE)
+        return Reason.OVER_TEMPERATURE.value
     if low:
-        return int(Reason.DC_LINK_UNDER_VOLTAGE)
+        return Reason.DC_LINK_UNDER_VOLTAGE.value
     if high:
-        return int(Reason.DC_LINK_OVER_VOLTAGE)
+        return Reason.DC_LINK_OVER_VOLTAGE.value
     return int(windows_trip(p, s, t))
 
 
@@ -148,8 +148,8 @@ def limit_step(value: float, previous: float, step: float) -> float:
 
 @jit
 def to_wire(value: float, lsb: float) -> float:
-    """Round to the resolution of the wire, as encoder and decoder do: rint(value / lsb) lsb."""
-    return np.rint(value / lsb) * lsb
+    """Round as encoder and decoder do: rint(value / lsb) lsb; + 0.0 since the wire has no negative zero."""
+    return float(np.rint(value / lsb) * lsb + 0.0)
 
 
 @jit
@@ -184,25 +184,25 @@ def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) ->
     flags = 0
     if not (math.isfinite(u_q) and math.isfinite(u_d) and math.isfinite(T_L)):
         u_q, u_d, T_L = 0.0, 0.0, 0.0
-        flags |= int(GuardFlag.NOT_A_NUMBER)
+        flags |= GuardFlag.NOT_A_NUMBER.value
     if is_denormal(u_q) or is_denormal(u_d) or is_denormal(T_L):
         u_q = 0.0 if is_denormal(u_q) else u_q
         u_d = 0.0 if is_denormal(u_d) else u_d
         T_L = 0.0 if is_denormal(T_L) else T_L
-        flags |= int(GuardFlag.DENORMAL)
+        flags |= GuardFlag.DENORMAL.value
     if t["state"] != DriveState.OPERATION_ENABLED:
-        flags |= int(GuardFlag.STATE_FORCES_ZERO) if (u_q != 0.0 or u_d != 0.0 or T_L != 0.0) else 0
+        flags |= GuardFlag.STATE_FORCES_ZERO.value if (u_q != 0.0 or u_d != 0.0 or T_L != 0.0) else 0
         return write_command(s, t, 0.0, 0.0, 0.0, flags)
     limit = voltage_limit(p, s)
     norm = math.sqrt(u_q * u_q + u_d * u_d)
     if norm > limit:
         u_q, u_d = u_q * limit / norm, u_d * limit / norm
-        flags |= int(GuardFlag.SOFT_START) if limit < p["u_max"] else int(GuardFlag.VOLTAGE)
+        flags |= GuardFlag.SOFT_START.value if limit < p["u_max"] else GuardFlag.VOLTAGE.value
     step_q, step_d = limit_step(u_q, s["u_q"], p["du_max"]), limit_step(u_d, s["u_d"], p["du_max"])
-    flags |= int(GuardFlag.VOLTAGE_STEP) if (step_q != u_q or step_d != u_d) else 0
+    flags |= GuardFlag.VOLTAGE_STEP.value if (step_q != u_q or step_d != u_d) else 0
     load = min(max(T_L, -p["T_L_max"]), p["T_L_max"])
-    flags |= int(GuardFlag.LOAD_TORQUE) if load != T_L else 0
-    flags |= int(GuardFlag.APPLIED_DEVIATES) if deviates(p, s, t) else 0
+    flags |= GuardFlag.LOAD_TORQUE.value if load != T_L else 0
+    flags |= GuardFlag.APPLIED_DEVIATES.value if deviates(p, s, t) else 0
     write_command(
         s, t, to_wire(step_q, p["u_lsb"]), to_wire(step_d, p["u_lsb"]), to_wire(load, p["T_L_lsb"]), flags
     )
@@ -215,7 +215,7 @@ def write_command(s: Any, t: Any, u_q: float, u_d: float, T_L: float, flags: int
     t["u_q"], t["u_d"], t["T_L"] = u_q, u_d, T_L
     s["u_q"], s["u_d"], s["T_L"] = u_q, u_d, T_L
     t["guard_flags"] = flags
-    return int(Reason.NONE)
+    return Reason.NONE.value
 
 
 @jit
@@ -224,8 +224,8 @@ def persistent_excess(p: Any, s: Any, flags: int) -> int:
 
     The soft start is a planned limit and does not count; a command that is not a number counts at once.
     """
-    changed = flags & ~(int(GuardFlag.SOFT_START) | int(GuardFlag.DENORMAL))
+    changed = flags & ~(GuardFlag.SOFT_START.value | GuardFlag.DENORMAL.value)
     s["clamped"] = s["clamped"] + 1 if changed else 0
-    if flags & int(GuardFlag.NOT_A_NUMBER):
-        return int(Reason.CONTROLLER_ERROR)
-    return int(Reason.GUARD_PERSISTENT) if s["clamped"] >= p["guard_trip_ticks"] else int(Reason.NONE)
+    if flags & GuardFlag.NOT_A_NUMBER.value:
+        return Reason.CONTROLLER_ERROR.value
+    return Reason.GUARD_PERSISTENT.value if s["clamped"] >= p["guard_trip_ticks"] else Reason.NONE.value

@@ -31,28 +31,28 @@ def judge_bus(p: Any, s: Any, t: Any) -> int:
         s["counter_level"], (flags & (RxFlag.COUNTER_REPEATED | RxFlag.COUNTER_JUMP)) != 0
     )
     if flags & RxFlag.BUS_DOWN:
-        return int(Reason.BUS_DOWN)
+        return Reason.BUS_DOWN.value
     if flags & RxFlag.SEND_FAILED:
-        return int(Reason.SEND_FAILED)
+        return Reason.SEND_FAILED.value
     if flags & RxFlag.FOREIGN_COMMAND:
-        return int(Reason.FOREIGN_COMMAND)
+        return Reason.FOREIGN_COMMAND.value
     if s["crc_level"] > 4 * p["error_budget"]:
-        return int(Reason.CRC_ERRORS)
+        return Reason.CRC_ERRORS.value
     if s["counter_level"] > 4 * p["error_budget"]:
-        return int(Reason.COUNTER_ERRORS)
-    return int(Reason.NONE)
+        return Reason.COUNTER_ERRORS.value
+    return Reason.NONE.value
 
 
 @jit
 def judge_drive(s: Any, t: Any) -> int:
     """Return the Reason to stop that the drive's own state gives, 0 for none."""
     if not t["rx_flags"] & RxFlag.FRESH:
-        return int(Reason.NONE)
+        return Reason.NONE.value
     if t["drive_state"] == DriveState.FAULT or t["drive_state"] == DriveState.FAULT_REACTION_ACTIVE:
-        return int(Reason.DRIVE_FAULT)
+        return Reason.DRIVE_FAULT.value
     if t["drive_state"] != DriveState.OPERATION_ENABLED:
-        return int(Reason.DRIVE_LEFT_OPERATION)
-    return int(Reason.NONE)
+        return Reason.DRIVE_LEFT_OPERATION.value
+    return Reason.NONE.value
 
 
 @jit
@@ -63,10 +63,10 @@ def judge_timing(p: Any, s: Any, t: Any) -> int:
     else:
         s["stale"] += t["gap"]
     if s["stale"] > p["hold_ticks"]:
-        return int(Reason.STALE_FEEDBACK)
+        return Reason.STALE_FEEDBACK.value
     if t["gap"] > p["max_gap"]:
-        return int(Reason.LOOP_OVERRUN)
-    return int(Reason.NONE)
+        return Reason.LOOP_OVERRUN.value
+    return Reason.NONE.value
 
 
 @jit
@@ -80,14 +80,14 @@ def judge(p: Any, s: Any, t: Any) -> int:
     """Return the most telling Reason to stop now, 0 for none. All judges run, so that all counts advance."""
     bus = judge_bus(p, s, t)
     timing = judge_timing(p, s, t)
-    measured = int(Reason.NONE)
+    measured = Reason.NONE.value
     if t["rx_flags"] & RxFlag.FRESH:
         measured = judge_measurement(p, s, t)
     reason = first(bus, measured)
     if s["state"] == DriveState.OPERATION_ENABLED:
         reason = first(reason, judge_drive(s, t))
     reason = first(reason, timing)
-    reason = first(reason, int(Reason.LOG_FAILED) if t["log_failed"] else 0)
+    reason = first(reason, Reason.LOG_FAILED.value if t["log_failed"] else 0)
     return first(reason, judge_request(t))
 
 
@@ -95,10 +95,10 @@ def judge(p: Any, s: Any, t: Any) -> int:
 def judge_request(t: Any) -> int:
     """Return the Reason that the operator's request gives."""
     if t["request"] == Request.QUICK_STOP:
-        return int(Reason.QUICK_STOP_REQUESTED)
+        return Reason.QUICK_STOP_REQUESTED.value
     if t["request"] == Request.STOP:
-        return int(Reason.STOP_REQUESTED)
-    return int(Reason.NONE)
+        return Reason.STOP_REQUESTED.value
+    return Reason.NONE.value
 
 
 @jit
@@ -118,7 +118,7 @@ def begin_stop(s: Any, reason: int) -> None:
     s["reason"] = reason
     s["stop_ticks"] = 0
     fault = is_fault(reason)
-    s["state"] = int(DriveState.FAULT_REACTION_ACTIVE) if fault else int(DriveState.QUICK_STOP_ACTIVE)
+    s["state"] = DriveState.FAULT_REACTION_ACTIVE.value if fault else DriveState.QUICK_STOP_ACTIVE.value
 
 
 @jit
@@ -129,18 +129,18 @@ def handshake(p: Any, s: Any, t: Any) -> int:
     """
     if t["rx_flags"] & RxFlag.FRESH:
         if t["drive_state"] == DriveState.OPERATION_ENABLED:
-            s["state"] = int(DriveState.OPERATION_ENABLED)
+            s["state"] = DriveState.OPERATION_ENABLED.value
             s["run_ticks"] = 0
-            return int(Controlword.ENABLE_OPERATION)
+            return Controlword.ENABLE_OPERATION.value
         if t["drive_state"] == DriveState.SWITCHED_ON:
-            s["state"] = int(DriveState.SWITCHED_ON)
-            return int(Controlword.ENABLE_OPERATION)
+            s["state"] = DriveState.SWITCHED_ON.value
+            return Controlword.ENABLE_OPERATION.value
         if t["drive_state"] == DriveState.READY_TO_SWITCH_ON:
-            return int(Controlword.SWITCH_ON)
+            return Controlword.SWITCH_ON.value
         if t["drive_state"] == DriveState.FAULT:
             odd = s["armed_ticks"] % 2 == 1
-            return int(Controlword.FAULT_RESET) if odd else int(Controlword.DISABLE_VOLTAGE)
-    return int(Controlword.SHUTDOWN)
+            return Controlword.FAULT_RESET.value if odd else Controlword.DISABLE_VOLTAGE.value
+    return Controlword.SHUTDOWN.value
 
 
 @jit
@@ -150,7 +150,7 @@ def arming(p: Any, s: Any, t: Any) -> int:
     reason = judge_arming(p, s, t)
     if reason != 0:
         begin_stop(s, reason)
-        return int(Controlword.DISABLE_VOLTAGE)
+        return Controlword.DISABLE_VOLTAGE.value
     return int(handshake(p, s, t))
 
 
@@ -160,10 +160,10 @@ def judge_arming(p: Any, s: Any, t: Any) -> int:
     reason = judge_bus(p, s, t)
     if t["rx_flags"] & RxFlag.FRESH:
         reason = first(reason, judge_measurement(p, s, t))
-    reason = first(reason, int(Reason.LOG_FAILED) if t["log_failed"] else 0)
+    reason = first(reason, Reason.LOG_FAILED.value if t["log_failed"] else 0)
     reason = first(reason, judge_request(t))
     timed_out = s["armed_ticks"] > p["enable_ticks"]
-    return first(reason, int(Reason.ENABLE_TIMEOUT) if timed_out else 0)
+    return first(reason, Reason.ENABLE_TIMEOUT.value if timed_out else 0)
 
 
 @jit
@@ -172,9 +172,9 @@ def operate(p: Any, s: Any, t: Any) -> int:
     reason = judge(p, s, t)
     if reason != 0:
         begin_stop(s, reason)
-        return int(Controlword.QUICK_STOP)
+        return Controlword.QUICK_STOP.value
     s["run_ticks"] += 1
-    return int(Controlword.ENABLE_OPERATION)
+    return Controlword.ENABLE_OPERATION.value
 
 
 @jit
@@ -183,14 +183,14 @@ def stopping(p: Any, s: Any, t: Any) -> int:
     s["stop_ticks"] += 1
     judge_timing(p, s, t)
     if s["state"] == DriveState.QUICK_STOP_ACTIVE and s["stale"] > p["quick_stop_ticks"]:
-        s["state"] = int(DriveState.FAULT_REACTION_ACTIVE)
+        s["state"] = DriveState.FAULT_REACTION_ACTIVE.value
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
     left = fresh and t["drive_state"] != DriveState.OPERATION_ENABLED
     if (left and s["stop_ticks"] >= 3) or s["stop_ticks"] >= STOP_TICKS + p["quick_stop_ticks"]:
         quick = s["state"] == DriveState.QUICK_STOP_ACTIVE
-        s["state"] = int(DriveState.SWITCH_ON_DISABLED) if quick else int(DriveState.FAULT)
-        return int(Controlword.DISABLE_VOLTAGE)
-    return int(Controlword.QUICK_STOP)
+        s["state"] = DriveState.SWITCH_ON_DISABLED.value if quick else DriveState.FAULT.value
+        return Controlword.DISABLE_VOLTAGE.value
+    return Controlword.QUICK_STOP.value
 
 
 @jit
@@ -202,10 +202,10 @@ def supervise(p: Any, s: Any, t: Any) -> None:
     stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down nothing is sent.
     """
     state = s["state"]
-    controlword = int(Controlword.DISABLE_VOLTAGE)
+    controlword = Controlword.DISABLE_VOLTAGE.value
     send = 1
     if state == DriveState.SWITCH_ON_DISABLED and s["reason"] == 0 and t["request"] == Request.ARM:
-        s["state"] = int(DriveState.READY_TO_SWITCH_ON)
+        s["state"] = DriveState.READY_TO_SWITCH_ON.value
         controlword = arming(p, s, t)
     elif state == DriveState.READY_TO_SWITCH_ON or state == DriveState.SWITCHED_ON:
         controlword = arming(p, s, t)

@@ -1,0 +1,197 @@
+"""A link: raw frames over any python-can interface, with its own non-blocking reads where there is a socket.
+
+python-can opens the bus. Where it has a socket of SocketCAN's frame layout (socketcan, hil-local) the link
+reads and writes that socket itself; any other interface goes through ``Bus.recv`` and ``Bus.send``.
+"""
+
+from __future__ import annotations
+
+import errno
+import select
+import socket
+import time
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import can
+
+from drivers.errors import LinkDown, LinkError, QueueFull
+from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, pack_frame
+
+_DOWN = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
+_FULL = {errno.ENOBUFS, errno.EAGAIN}
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """The bus in python-can's terms."""
+
+    interface: str
+    channel: str
+    bitrate: int = 1_000_000
+    data_bitrate: int | None = None
+    fd: bool = False
+
+
+class Frame(NamedTuple):
+    """One received frame; ``flags`` are SocketCAN's EFF, RTR and ERR bits."""
+
+    can_id: int
+    data: bytes
+    flags: int
+    fd: bool
+
+
+class Link(Protocol):
+    """What the drive client and the emulator need of a bus."""
+
+    def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
+        """Send a data frame. Raises LinkDown, QueueFull or LinkError."""
+
+    def receive(self, timeout_ns: int) -> Frame | None:
+        """Return the next frame, or None after ``timeout_ns`` (0: at once). Raises LinkError."""
+
+    def discard(self) -> int:
+        """Throw away everything received and not read; return how many frames."""
+
+    def close(self) -> None:
+        """Close the bus."""
+
+
+def raise_link_error(error: OSError, action: str) -> None:
+    """Raise what an OSError of the bus means."""
+    code = error.errno or 0
+    if code in _DOWN:
+        raise LinkDown(code, f"can't {action}: the CAN interface is down or gone; bring it up") from error
+    if code in _FULL:
+        raise QueueFull(code, f"can't {action}: the transmit queue is full; is the bus connected?") from error
+    raise LinkError(code, f"can't {action}: {error}") from error
+
+
+class SocketLink:
+    """A link over sockets of SocketCAN's frame layout."""
+
+    def __init__(self, bus: can.BusABC, receiving: socket.socket, sending: socket.socket) -> None:
+        self._bus, self._receiving, self._sending = bus, receiving, sending
+        self._fds = [receiving.fileno()]
+        receiving.setblocking(False)
+
+    def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
+        """Send a data frame."""
+        try:
+            self._sending.send(pack_frame(can_id, data, fd))
+        except OSError as error:
+            raise_link_error(error, "send")
+
+    def receive(self, timeout_ns: int) -> Frame | None:
+        """Return the next frame, or None."""
+        try:
+            if timeout_ns > 0 and not select.select(self._fds, [], [], timeout_ns * 1e-9)[0]:
+                return None
+            raw = self._receiving.recv(128)
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise_link_error(error, "receive")
+        return _unpack(raw)
+
+    def discard(self) -> int:
+        """Throw away what is queued."""
+        count = 0
+        while self.receive(0) is not None:
+            count += 1
+        return count
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._bus.shutdown()
+
+
+def _unpack(raw: bytes) -> Frame | None:
+    """A frame from SocketCAN's layout; anything else on the socket is no frame."""
+    if len(raw) == CLASSIC.size:
+        can_id, length, data = CLASSIC.unpack(raw)
+        fd, top = False, 8
+    elif len(raw) == FD.size:
+        can_id, length, _, data = FD.unpack(raw)
+        fd, top = True, 64
+    else:
+        return None
+    if length > top:
+        return None
+    flags = can_id & (EFF_FLAG | RTR_FLAG | ERR_FLAG)
+    return Frame(can_id & 0x1FFFFFFF, data[:length], flags, fd)
+
+
+class GenericLink:
+    """A link through python-can's own recv and send, for interfaces without a socket."""
+
+    def __init__(self, bus: can.BusABC) -> None:
+        self._bus = bus
+
+    def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
+        """Send a data frame."""
+        message = can.Message(
+            arbitration_id=can_id & 0x1FFFFFFF,
+            is_extended_id=bool(can_id & EFF_FLAG),
+            data=data,
+            is_fd=fd,
+            bitrate_switch=fd,
+        )
+        try:
+            self._bus.send(message)
+        except can.CanError as error:
+            raise LinkError(errno.EIO, f"can't send: {error}") from error
+
+    def receive(self, timeout_ns: int) -> Frame | None:
+        """Return the next frame, or None."""
+        try:
+            message = self._bus.recv(timeout_ns * 1e-9)
+        except can.CanError as error:
+            raise LinkError(errno.EIO, f"can't receive: {error}") from error
+        if message is None:
+            return None
+        flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
+        flags |= ERR_FLAG if message.is_error_frame else 0
+        return Frame(message.arbitration_id, bytes(message.data), flags, message.is_fd)
+
+    def discard(self) -> int:
+        """Throw away what is queued."""
+        count = 0
+        while self.receive(0) is not None:
+            count += 1
+        return count
+
+    def close(self) -> None:
+        """Close the bus."""
+        self._bus.shutdown()
+
+
+def open_link(settings: BusSettings) -> Link:
+    """Open a bus. Raises LinkError with python-can's own words when it can't be opened."""
+    options: dict[str, object] = {"fd": settings.fd}
+    if settings.interface not in ("socketcan", "hil-local", "virtual"):
+        options["bitrate"] = settings.bitrate
+        if settings.data_bitrate:
+            options["data_bitrate"] = settings.data_bitrate
+    if settings.interface == "virtual":
+        options = {}
+    try:
+        bus = can.Bus(interface=settings.interface, channel=settings.channel, **options)  # type: ignore[arg-type]
+    except (can.CanError, OSError, ValueError, ImportError) as error:
+        remedy = f"is {settings.channel!r} up? ip link set {settings.channel} up"
+        if settings.interface != "socketcan":
+            remedy = "see python-can's documentation of this interface"
+        raise LinkError(
+            errno.ENODEV, f"can't open bus {settings.interface}:{settings.channel}: {error}; {remedy}"
+        ) from error
+    if isinstance(bus, LocalBus):
+        return SocketLink(bus, bus.receiving, bus.sending)
+    if settings.interface == "socketcan":
+        return SocketLink(bus, bus.socket, bus.socket)  # type: ignore[attr-defined]
+    return GenericLink(bus)
+
+
+def monotonic_deadline(timeout_s: float) -> int:
+    """Absolute monotonic deadline [ns]."""
+    return time.monotonic_ns() + round(timeout_s * 1e9)

@@ -1,0 +1,166 @@
+"""`hil-local`: a CAN bus between processes of one machine, registered with python-can as a plugin.
+
+Frames travel as SocketCAN's can_frame / canfd_frame in UDP multicast datagrams that are sent from and joined
+on the loopback interface alone, with TTL 0: no frame leaves the machine, and no network is needed. The
+channel's name picks the multicast group, so that buses of different names do not meet.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import select
+import socket
+import struct
+import time
+import zlib
+from typing import Any
+
+import can
+
+LOOPBACK = "127.0.0.1"
+PORT = 47113
+CLASSIC = struct.Struct("=IB3x8s")
+FD = struct.Struct("=IBB2x64s")
+EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
+FD_BRS, FD_ESI, FD_FDF = 0x01, 0x02, 0x04
+_SO_ATTACH_FILTER = 26
+_IP_MULTICAST_ALL = 49
+
+
+def group_of(channel: str) -> str:
+    """Multicast group of a channel, in the organisation-local range 239.192.0.0/14."""
+    digest = zlib.crc32(channel.encode())
+    return f"239.{192 + (digest >> 16 & 3)}.{digest >> 8 & 255}.{digest & 255}"
+
+
+def pack_frame(can_id: int, data: bytes, fd: bool = False) -> bytes:
+    """SocketCAN layout of a data frame; identifiers over 11 bits get the extended flag by the caller."""
+    if fd:
+        return FD.pack(can_id, len(data), FD_FDF | FD_BRS, bytes(data))
+    return CLASSIC.pack(can_id, len(data), bytes(data))
+
+
+def _drop_source_port(sock: socket.socket, port: int) -> None:
+    """Let the kernel drop datagrams whose UDP source port is ``port`` (a four-line classic BPF program)."""
+    load, jump, accept, drop = (0x28, 0, 0, 0), (0x15, 1, 0, port), (0x06, 0, 0, 0xFFFFFFFF), (0x06, 0, 0, 0)
+    program = b"".join(struct.pack("HBBI", *line) for line in (load, jump, accept, drop))
+    buffer = ctypes.create_string_buffer(program)
+    filter_program = struct.pack("HL", 4, ctypes.addressof(buffer))
+    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filter_program)
+
+
+def _loopback_index() -> int:
+    return socket.if_nametoindex("lo")
+
+
+def open_sockets(channel: str, own: bool) -> tuple[socket.socket, socket.socket]:
+    """Return (receiving, sending) sockets of a channel. Raises OSError when loopback is down."""
+    group = group_of(channel)
+    membership = struct.pack("=4s4si", socket.inet_aton(group), socket.inet_aton(LOOPBACK), _loopback_index())
+    receiving = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+    sending = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        receiving.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+        receiving.bind((group, PORT))
+        receiving.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+        receiving.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
+        sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        sending.bind((LOOPBACK, 0))
+        sending.connect((group, PORT))
+        if not own:
+            _drop_source_port(receiving, sending.getsockname()[1])
+    except OSError:
+        receiving.close()
+        sending.close()
+        raise
+    return receiving, sending
+
+
+class LocalBus(can.BusABC):
+    """python-can interface `hil-local`.
+
+    ``channel`` is any name; ``bitrate`` and ``data_bitrate`` are accepted and have no effect, as on vcan.
+    """
+
+    def __init__(
+        self,
+        channel: str | None = "demo",
+        fd: bool = True,
+        receive_own_messages: bool = False,
+        bitrate: int | None = None,
+        data_bitrate: int | None = None,
+        **kwargs: Any,  # python-can hands its own options (can_filters, ...) through to BusABC
+    ) -> None:
+        self._channel = str(channel or "demo")
+        self.fd = fd
+        try:
+            self.receiving, self.sending = open_sockets(self._channel, receive_own_messages)
+        except OSError as error:
+            raise can.CanInitializationError(
+                f"hil-local: loopback can't be used ({error}); bring it up: ip link set lo up"
+            ) from error
+        self.channel_info = f"hil-local channel {self._channel} ({group_of(self._channel)} on lo)"
+        super().__init__(self._channel, **kwargs)
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Send one message. Raises CanOperationError."""
+        can_id = msg.arbitration_id
+        can_id |= EFF_FLAG if msg.is_extended_id else 0
+        can_id |= RTR_FLAG if msg.is_remote_frame else 0
+        can_id |= ERR_FLAG if msg.is_error_frame else 0
+        if msg.is_fd:
+            flags = FD_FDF | (FD_BRS if msg.bitrate_switch else 0)
+            raw = FD.pack(can_id, msg.dlc, flags | (FD_ESI if msg.error_state_indicator else 0), bytes(msg.data))
+        else:
+            raw = CLASSIC.pack(can_id, msg.dlc, bytes(msg.data))
+        try:
+            self.sending.send(raw)
+        except OSError as error:
+            raise can.CanOperationError(f"hil-local: can't send: {error}", error.errno) from error
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not select.select([self.receiving], [], [], timeout)[0]:
+            return None, False
+        try:
+            raw = self.receiving.recv(128)
+        except BlockingIOError:
+            return None, False
+        return self._message(raw), False
+
+    def _message(self, raw: bytes) -> can.Message | None:
+        """A python-can message from SocketCAN's layout; None for a datagram that is none."""
+        if len(raw) not in (CLASSIC.size, FD.size):
+            return None
+        fd = len(raw) == FD.size
+        can_id, length, flags, data = FD.unpack(raw) if fd else (*CLASSIC.unpack(raw)[:2], 0, raw[8:])
+        if length > (64 if fd else 8):
+            return None
+        remote = bool(can_id & RTR_FLAG)
+        return can.Message(
+            timestamp=time.time(),
+            arbitration_id=can_id & (0x1FFFFFFF if can_id & EFF_FLAG else 0x7FF),
+            is_extended_id=bool(can_id & EFF_FLAG),
+            is_remote_frame=remote,
+            is_error_frame=bool(can_id & ERR_FLAG),
+            is_fd=fd,
+            bitrate_switch=bool(flags & FD_BRS),
+            error_state_indicator=bool(flags & FD_ESI),
+            dlc=length,
+            data=None if remote else data[:length],
+            channel=self._channel,
+            is_rx=True,
+        )
+
+    def fileno(self) -> int:
+        """File descriptor of the receiving socket."""
+        return self.receiving.fileno()
+
+    def shutdown(self) -> None:
+        """Close both sockets."""
+        super().shutdown()
+        self.receiving.close()
+        self.sending.close()

@@ -1,0 +1,230 @@
+"""Configuration of the emulated drive: typed tables with units in the key names, turned into records.
+
+Reading the file is left to the caller; this module knows only what a plant consists of.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
+
+from firmware_model.load import coupler_torque_max
+from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Record = npt.NDArray[np.void]
+
+
+class Table(BaseModel):
+    """Base of all tables: frozen, unknown keys refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class PlantMotor(Table):
+    """The true motor."""
+
+    name: str = ""
+    R_s_ohm: Positive
+    L_d_h: Positive
+    L_q_h: Positive
+    psi_f_wb: Positive
+    n_p: Annotated[int, Field(ge=1, le=100)]
+    J_kg_m2: Positive
+    B_f_n_m_s: NonNegative = 0.0
+
+
+class Inverter(Table):
+    """DC link and resolution of the modulator (0: none)."""
+
+    v_dc_v: Positive = 540.0
+    resolution_v: NonNegative = 0.02
+
+
+class Sensors(Table):
+    """Standard deviation of the noise on speed and currents; resolution and range are the wire's."""
+
+    w_noise_rad_s: NonNegative = 0.0
+    i_noise_a: NonNegative = 0.0
+
+
+class Firmware(Table):
+    """Protection of the drive itself."""
+
+    watchdog_ms: NonNegative = 20.0
+    i_trip_a: Positive = 30.0
+    w_trip_rad_s: Positive = 300.0
+    temperature_trip_c: Positive = 140.0
+    ambient_c: Finite = 25.0
+    thermal_resistance_k_w: Positive = 0.5
+    thermal_time_s: Positive = 600.0
+    status_every: Annotated[int, Field(ge=1)] = 10
+
+
+class ConstantLoad(Table):
+    """A constant torque."""
+
+    kind: Literal["constant"]
+    torque_n_m: Finite
+
+
+class StepLoad(Table):
+    """A torque from one time until another."""
+
+    kind: Literal["step"]
+    torque_n_m: Finite
+    at_s: NonNegative
+    until_s: Positive | None = None
+
+
+class SineLoad(Table):
+    """A sinusoidal torque."""
+
+    kind: Literal["sine"]
+    torque_n_m: Finite
+    frequency_hz: Positive
+    phase_rad: Finite = 0.0
+
+
+class FanLoad(Table):
+    """T = k w |w|."""
+
+    kind: Literal["fan"]
+    k_n_m_s2: Positive
+
+
+class CouplerLoad(Table):
+    """Permanent-magnet eddy-current coupler; the air gap sets its torque."""
+
+    kind: Literal["coupler"]
+    torque_at_zero_gap_n_m: Positive
+    gap_mm: NonNegative
+    decay_length_mm: Positive
+    slip_at_max_rad_s: Positive
+    other_side_rad_s: Finite = 0.0
+
+
+Load = Annotated[
+    ConstantLoad | StepLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")
+]
+
+
+class Disturbance(Table):
+    """Unknown constants phi of (33)."""
+
+    phi_w_rad_s2: Finite = 0.0
+    phi_q_a_s: Finite = 0.0
+
+
+def included(value: Any, info: ValidationInfo) -> Any:
+    """A table may be the path of a TOML file that holds it; the caller's context knows how to read it."""
+    return info.context["include"](value) if isinstance(value, str) and info.context else value
+
+
+class PlantConfig(Table):
+    """The whole emulated drive."""
+
+    dbc: str
+    node_id: Annotated[int, Field(ge=1, le=127)] = 1
+    clock: Literal["realtime", "lockstep"] = "realtime"
+    pacing: Literal["sync", "cyclic"] = "sync"
+    period_us: Annotated[int, Field(ge=50)] = 1000
+    substep_us: Annotated[int, Field(ge=1)] = 100
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+    truth: bool = True
+    motor: Annotated[PlantMotor, BeforeValidator(included)]
+    inverter: Inverter = Inverter()
+    sensors: Sensors = Sensors()
+    firmware: Firmware = Firmware()
+    disturbance: Disturbance = Disturbance()
+    load: Annotated[list[Load], Field(max_length=MAX_LOADS)] = []
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """Resolution and range of the measured signals on the wire (from the DBC)."""
+
+    w_lsb: float
+    w_top: float
+    i_q_lsb: float
+    i_q_top: float
+    i_d_lsb: float
+    i_d_top: float
+
+
+def _load_row(load: Any) -> tuple[int, float, float, float]:
+    """Kind and the parameters a, b, c of one load, as :data:`firmware_model.plant.PARAMS` says."""
+    if isinstance(load, ConstantLoad):
+        return int(LoadKind.CONSTANT), load.torque_n_m, 0.0, 0.0
+    if isinstance(load, StepLoad):
+        return int(LoadKind.STEP), load.torque_n_m, load.at_s, load.until_s or math.inf
+    if isinstance(load, SineLoad):
+        return int(LoadKind.SINE), load.torque_n_m, load.frequency_hz, load.phase_rad
+    if isinstance(load, FanLoad):
+        return int(LoadKind.FAN), load.k_n_m_s2, 0.0, 0.0
+    top = coupler_torque_max(load.torque_at_zero_gap_n_m, load.gap_mm, load.decay_length_mm)
+    return int(LoadKind.COUPLER), top, load.slip_at_max_rad_s, load.other_side_rad_s
+
+
+def build_params(config: PlantConfig, wire: Wire) -> Record:
+    """The parameter record of a plant: a one-element array of PARAMS."""
+    p = np.zeros(1, PARAMS)
+    motor, firmware, inverter = config.motor, config.firmware, config.inverter
+    values: dict[str, float] = {
+        "R_s": motor.R_s_ohm,
+        "L_d": motor.L_d_h,
+        "L_q": motor.L_q_h,
+        "psi_f": motor.psi_f_wb,
+        "n_p": motor.n_p,
+        "J": motor.J_kg_m2,
+        "B_f": motor.B_f_n_m_s,
+        "phi_w": config.disturbance.phi_w_rad_s2,
+        "phi_q": config.disturbance.phi_q_a_s,
+        "substep_ns": config.substep_us * 1000,
+        "v_dc": inverter.v_dc_v,
+        "u_lsb": inverter.resolution_v,
+        "w_lsb": wire.w_lsb,
+        "i_q_lsb": wire.i_q_lsb,
+        "i_d_lsb": wire.i_d_lsb,
+        "w_top": wire.w_top,
+        "i_q_top": wire.i_q_top,
+        "i_d_top": wire.i_d_top,
+        "w_noise": config.sensors.w_noise_rad_s,
+        "i_noise": config.sensors.i_noise_a,
+        "watchdog_ns": round(firmware.watchdog_ms * 1e6),
+        "i_trip": firmware.i_trip_a,
+        "w_trip": firmware.w_trip_rad_s,
+        "temperature_trip": firmware.temperature_trip_c,
+        "ambient": firmware.ambient_c,
+        "thermal_resistance": firmware.thermal_resistance_k_w,
+        "thermal_time": firmware.thermal_time_s,
+        "status_every": firmware.status_every,
+        "seed": config.seed,
+    }
+    for name, value in values.items():
+        p[name] = value
+    for j, load in enumerate(config.load):
+        p["load_kind"][0, j], p["load_a"][0, j], p["load_b"][0, j], p["load_c"][0, j] = _load_row(load)
+    return p
+
+
+def new_state(p: Record, echo_none: int) -> Record:
+    """A drive that has just booted: standing still, SWITCH_ON_DISABLED, no command yet."""
+    s = np.zeros(1, STATE)
+    s["state"] = int(State.SWITCH_ON_DISABLED)
+    s["echo"] = echo_none
+    s["temperature"] = p["ambient"]
+    s["random"] = p["seed"]
+    return s
+
+
+def new_sample() -> Record:
+    """An empty sample."""
+    return np.zeros(1, SAMPLE)

@@ -1,0 +1,166 @@
+"""From a run configuration to the records that the kernel runs on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.config import ChannelTable, LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
+from hil.control.references import reference
+from hil.guard import SAFETY_PARAMS
+from hil.kernel import new_safety_state, prepare, step
+from hil.signals import TickArray, new_ticks
+
+Record = npt.NDArray[np.void]
+
+
+@dataclass(frozen=True, slots=True)
+class WireFacts:
+    """What the kernel must know of the wire: command resolution [V, N m], counter, measurement LSBs."""
+
+    u_lsb: float
+    T_L_lsb: float
+    counter_modulus: int
+    x_lsb: tuple[float, float, float]
+    u_top: float
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """Parameters and states of one controller; :meth:`step` runs a tick in place."""
+
+    safety: Record
+    safety_state: Record
+    law: Record
+    law_state: Record
+    reference: Record
+
+    def prepare(self, ticks: TickArray) -> None:
+        """Write this tick's reference."""
+        prepare(self.reference, self.safety_state, self.law, ticks)
+
+    def step(self, ticks: TickArray) -> None:
+        """Run one tick."""
+        step(self.safety, self.safety_state, self.law, self.law_state, ticks)
+
+    def fresh(self) -> Machine:
+        """The same controller before its first tick."""
+        return Machine(self.safety, new_safety_state(), self.law, new_law_state(), self.reference)
+
+    def warm_up(self) -> None:
+        """Compile every kernel on copies, before anything is armed."""
+        other, ticks = self.fresh(), new_ticks()
+        other.prepare(ticks)
+        other.step(ticks)
+
+
+def motor_model(table: MotorTable) -> MotorModel:
+    """The motor that the controller believes in."""
+    return MotorModel(
+        table.R_s_ohm, table.L_d_h, table.L_q_h, table.psi_f_wb, table.n_p, table.J_kg_m2, table.B_f_n_m_s
+    )
+
+
+def _channel(table: ChannelTable) -> ChannelSpec:
+    delay_s = (table.delay_ms or 0.0) * 1e-3
+    return ChannelSpec(table.kind, table.gamma_1_rad_s, table.gamma_2_rad_s or 0.0, delay_s)
+
+
+def law_spec(config: RunConfig) -> LawSpec:
+    """The law's tuning. Raises ControlDesignError only when designed."""
+    controller = config.controller
+    return LawSpec(
+        kind=controller.kind,
+        motor=motor_model(config.motor),
+        speed=_channel(config.observer.speed),
+        current=_channel(config.observer.current),
+        speed_pole=controller.speed_pole_rad_s,
+        current_pole=controller.current_pole_rad_s,
+        current_d_pole=controller.current_d_pole_rad_s or controller.current_pole_rad_s,
+        i_max=config.limits.i_max_a,
+        T_L_max=config.limits.T_L_max_n_m,
+        coupling=controller.compensate_coupling,
+    )
+
+
+def safety_params(config: RunConfig, wire: WireFacts) -> Record:
+    """Limits and times as the guard and the supervisor use them."""
+    limits, feedback = config.limits, config.feedback
+    rate = config.loop.rate_hz
+    p = np.zeros(1, SAFETY_PARAMS)
+    values: dict[str, float] = {
+        "T_s": 1.0 / rate,
+        "w_max": limits.w_max_rad_s,
+        "i_trip": limits.i_trip_a,
+        "u_max": min(limits.u_max_v, wire.u_top),
+        "du_max": limits.du_max_v,
+        "T_L_max": limits.T_L_max_n_m,
+        "v_dc_min": limits.v_dc_min_v,
+        "v_dc_max": limits.v_dc_max_v,
+        "temperature_max": limits.temperature_max_c,
+        "power_window": limits.power_window_s,
+        "trip_ticks": limits.trip_ticks,
+        "guard_trip_ticks": limits.guard_trip_ticks,
+        "soft_start_ticks": round(limits.soft_start_s * rate),
+        "hold_ticks": feedback.hold_ticks,
+        "quick_stop_ticks": feedback.quick_stop_ticks,
+        "error_budget": feedback.error_budget,
+        "enable_ticks": round(feedback.enable_timeout_s * rate),
+        "max_gap": config.loop.max_gap_ticks,
+        "counter_modulus": wire.counter_modulus,
+        "u_lsb": wire.u_lsb,
+        "T_L_lsb": wire.T_L_lsb,
+        "J": config.motor.J_kg_m2,
+    }
+    for name, value in (values | _optional(limits)).items():
+        p[name] = value
+    return p
+
+
+def _optional(limits: LimitsTable) -> dict[str, float]:
+    """Limits that a config may leave out: then they never trip."""
+
+    def or_never(value: float | None) -> float:
+        return math.inf if value is None else value
+
+    return {
+        "i_continuous": limits.i_continuous_a or limits.i_max_a,
+        "i2t_max": or_never(limits.i2t_max_a2s),
+        "energy_max": or_never(limits.energy_max_j),
+        "deviation_max": or_never(limits.applied_deviation_max_v),
+    }
+
+
+def reference_record(table: ReferenceTable) -> Record:
+    """The reference profile of the config."""
+    given = table.model_dump(exclude={"kind", "t_s"}, exclude_none=True)
+    names = {
+        "w_rad_s": "w",
+        "amplitude_rad_s": "w",
+        "at_s": "at",
+        "down_at_s": "down_at",
+        "rate_rad_s2": "rate",
+        "jerk_rad_s3": "jerk",
+        "offset_rad_s": "offset",
+        "frequency_hz": "frequency",
+        "i_q_a": "i_q",
+    }
+    if table.kind == "table":
+        return reference("table", i_q=table.i_q_a, table=(table.t_s, table.w_rad_s))
+    return reference(table.kind, **{names[key]: value for key, value in given.items()})
+
+
+def build(config: RunConfig, wire: WireFacts) -> Machine:
+    """Design the controller of a run. Raises ControlDesignError."""
+    law = design_law(law_spec(config), 1.0 / config.loop.rate_hz)
+    return Machine(
+        safety_params(config, wire),
+        new_safety_state(),
+        law,
+        new_law_state(),
+        reference_record(config.reference),
+    )

@@ -1,0 +1,121 @@
+"""The whole of a tick as one pure compiled function: observe, judge, control, guard, command.
+
+The loop, replay and simulation all call :func:`step`, so that their outputs are the same to the bit. Inputs
+and outputs are fields of one TICK record; parameters and states are the records of safety and law.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.control.jit import jit
+from hil.control.law import FAC, apply, command, observe, reset
+from hil.control.references import reference_at
+from hil.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
+from hil.signals import Controlword, DriveState, Reason, RxFlag
+from hil.supervisor import begin_stop, supervise
+
+Record = npt.NDArray[np.void]
+
+__all__ = ["SAFETY_PARAMS", "SAFETY_STATE", "new_safety_state", "prepare", "step"]
+
+
+def new_safety_state() -> Record:
+    """Disarmed, nothing sent."""
+    s = np.zeros(1, SAFETY_STATE)
+    s["state"] = DriveState.SWITCH_ON_DISABLED.value
+    return s
+
+
+@jit
+def applied_now(s: Any, t: Any) -> None:
+    """Find what is applied from this tick on: by the echo when feedback is fresh, else the newest command.
+
+    In every drive state but OPERATION_ENABLED the gates are off: zero.
+    """
+    if not t["rx_flags"] & RxFlag.FRESH:
+        s["ua_q"], s["ua_d"], s["ua_T"] = s["u_q"], s["u_d"], s["T_L"]
+        return
+    if t["drive_state"] == DriveState.OPERATION_ENABLED:
+        echo = t["echo"] % 256
+        s["ua_q"], s["ua_d"], s["ua_T"] = s["sent_q"][echo], s["sent_d"][echo], s["sent_T"][echo]
+    else:
+        s["ua_q"], s["ua_d"], s["ua_T"] = 0.0, 0.0, 0.0
+
+
+@jit
+def estimate(s: Any, lp: Any, ls: Any, t: Any) -> None:
+    """Advance the observer by the past periods; a measurement that is not finite is no measurement."""
+    fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
+    finite = math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])
+    observe(lp, ls, t["w"], t["i_q"], t["i_d"], fresh and finite, t["gap"])
+    t["ua_q"], t["ua_d"] = ls["ua"][1], ls["ua"][2]
+    applied_now(s, t)
+    apply(ls, s["ua_T"], s["ua_q"], s["ua_d"])
+
+
+@jit
+def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
+    """Ask the law for the next command; without fresh feedback hold the last one."""
+    if t["state"] != DriveState.OPERATION_ENABLED:
+        t["u_q_law"], t["u_d_law"], t["T_L_law"], t["i_q_ref"] = 0.0, 0.0, 0.0, 0.0
+        return
+    if not (t["rx_flags"] & RxFlag.FRESH and ls["started"]):
+        t["u_q_law"], t["u_d_law"], t["T_L_law"] = s["u_q"], s["u_d"], s["T_L"]
+        return
+    command(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], voltage_limit(p, s))
+    t["T_L_law"], t["u_q_law"], t["u_d_law"] = ls["u"][0], ls["u"][1], ls["u"][2]
+    t["i_q_ref"] = ls["i_q_ref"]
+
+
+@jit
+def remember(p: Any, s: Any, t: Any) -> None:
+    """Number the command and keep it until the drive echoes its number."""
+    if not t["send"]:
+        return
+    s["counter"] = (s["counter"] + 1) % p["counter_modulus"]
+    t["counter"] = s["counter"]
+    s["sent_q"][s["counter"]], s["sent_d"][s["counter"]] = t["u_q"], t["u_d"]
+    s["sent_T"][s["counter"]] = t["T_L"]
+
+
+@jit
+def report(p: Any, ls: Any, t: Any) -> None:
+    """Write the estimates to the tick."""
+    t["d_hat_w"], t["d_hat_q"], t["d_hat_d"] = ls["d_hat"][0], ls["d_hat"][1], ls["d_hat"][2]
+    t["T_L_hat"] = -p["J"] * ls["d_hat"][0] + 0.0
+    t["filled"] = ls["filled"]
+
+
+@jit
+def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
+    """Run one tick. ``sp, ss``: safety parameters and state; ``lp, ls``: the law's; ``ticks``: one TICK."""
+    p, s, q, law, t = sp[0], ss[0], lp[0], ls[0], ticks[0]
+    estimate(s, q, law, t)
+    before = s["state"]
+    supervise(p, s, t)
+    if t["state"] == DriveState.OPERATION_ENABLED and before != DriveState.OPERATION_ENABLED:
+        reset(law)
+        observe(q, law, t["w"], t["i_q"], t["i_d"], True, t["gap"])
+    control(p, s, q, law, t)
+    reason = guard_command(p, s, t, t["u_q_law"], t["u_d_law"], t["T_L_law"])
+    if reason != Reason.NONE:
+        begin_stop(s, reason)
+        t["state"], t["reason"] = s["state"], s["reason"]
+        t["controlword"] = Controlword.QUICK_STOP.value
+        guard_command(p, s, t, 0.0, 0.0, 0.0)
+    remember(p, s, t)
+    report(p, law, t)
+
+
+@jit
+def prepare(rp: Any, ss: Any, lp: Any, ticks: Any) -> None:
+    """Write the reference of this tick; its time begins when operation is enabled."""
+    t, s = ticks[0], ss[0]
+    w_ref, dw_ref = reference_at(rp[0], s["run_ticks"] * lp[0]["T_s"])
+    t["w_ref"], t["dw_ref"] = w_ref, dw_ref
+    t["i_q_ref_in"] = rp[0]["i_q"] if lp[0]["kind"] == FAC else 0.0
