@@ -133,9 +133,7 @@ class PlantConfig(Table):
 
     dbc: str
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
-    clock: Literal["realtime", "lockstep"] = "realtime"
     pacing: Literal["sync", "cyclic"] = "sync"
-    period_us: Annotated[int, Field(ge=50)] = 1000
     substep_us: Annotated[int, Field(ge=1)] = 100
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
     truth: bool = True

@@ -1,0 +1,322 @@
+"""Composition root: the only place that wires configuration, drivers, clock, recorder and loop together."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import platform
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from drivers.bus import BusSettings, Link, open_link
+from drivers.client import DriveClient, ignore_frame
+from drivers.codec import Database
+from drivers.errors import DriverError, LinkError
+from hil import realtime
+from hil.clock import LockstepClock, RealClock
+from hil.config import RunConfig, load_toml
+from hil.design import Machine, WireFacts, build
+from hil.errors import ArmingError, HilError
+from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
+from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.signals import Reason, new_ticks
+
+EMULATED_INTERFACES = ("hil-local", "virtual")
+
+
+@dataclass(frozen=True, slots=True)
+class Overrides:
+    """What the command line puts on top of the config; python-can's own flags."""
+
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = None
+    fd: bool = False
+    settings: tuple[str, ...] = ()
+
+    def as_settings(self) -> list[str]:
+        """The same as ``table.key=value`` settings."""
+        out = list(self.settings)
+        out += [f"bus.interface={json.dumps(self.interface)}"] if self.interface else []
+        out += [f"bus.channel={json.dumps(self.channel)}"] if self.channel else []
+        out += [f"bus.bitrate={self.bitrate}"] if self.bitrate else []
+        out += ["bus.fd=true"] if self.fd else []
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """A configuration with everything that belongs to it loaded and designed; nothing is open yet."""
+
+    path: Path
+    config: RunConfig
+    database: Database
+    wire: WireFacts
+    machine: Machine
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run was, for people and for ``--json``."""
+
+    log: str
+    outcome: Outcome
+    complete: bool
+    dropped: int
+    grants: list[realtime.Grant] = field(default_factory=list)
+
+    @property
+    def ok(self) -> bool:
+        """True when the run ended by request and lost nothing."""
+        asked = self.outcome.reason in (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED)
+        return asked and self.complete and self.dropped == 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "log": self.log,
+            "ticks": self.outcome.ticks,
+            "skipped": self.outcome.skipped,
+            "ended": Reason(self.outcome.reason).name.lower(),
+            "dropped": self.dropped,
+            "log_complete": self.complete,
+            "ok": self.ok,
+        }
+
+
+def wire_facts(database: Database) -> WireFacts:
+    """What the kernel needs of a DBC of the house protocol. Raises DatabaseError."""
+    command = database.message("COMMAND", "Counter", "Controlword", "VoltageQ", "VoltageD")
+    feedback = database.message("FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State").signals
+    load = database.messages.get("LOAD_COMMAND", command).signals.get("LoadTorque")
+    voltage = command.signals["VoltageQ"]
+    return WireFacts(
+        u_lsb=voltage.scale,
+        T_L_lsb=load.scale if load else 0.01,
+        counter_modulus=command.counter_modulus,
+        x_lsb=(feedback["Speed"].scale, feedback["CurrentQ"].scale, feedback["CurrentD"].scale),
+        u_top=voltage.top,
+    )
+
+
+def load_setup(path: Path, overrides: Overrides) -> Setup:
+    """Load and check everything of a run without opening or sending anything."""
+    config = load_toml(path, RunConfig, overrides.as_settings())
+    database = Database(path.parent / config.drive.dbc, config.drive.node_id)
+    wire = wire_facts(database)
+    return Setup(path, config, database, wire, build(config, wire))
+
+
+def bus_settings(config: RunConfig) -> BusSettings:
+    """The bus table in the drivers' terms."""
+    bus = config.bus
+    return BusSettings(bus.interface, bus.channel, bus.bitrate, bus.data_bitrate, bus.fd)
+
+
+def is_emulated_bus(config: RunConfig) -> bool:
+    """True for buses that no real drive hangs on: hil-local, python-can's virtual, vcan."""
+    return config.bus.interface in EMULATED_INTERFACES or config.bus.channel.startswith("vcan")
+
+
+def log_path(setup: Setup, kind: str) -> Path:
+    """Where the run's log goes: the configured name, or config name, kind and UTC time."""
+    log = setup.config.log
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
+    name = log.name or f"{setup.path.stem}-{kind}-{stamp}"
+    return (setup.path.parent / log.folder / f"{name}.mcap").resolve()
+
+
+def _git_commit() -> str:
+    try:
+        return subprocess.run(
+            ["git", "rev-parse", "HEAD"],  # noqa: S607 - whatever git the user has
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            timeout=5,
+            check=True,
+        ).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def package_version(name: str) -> str:
+    """Version of an installed package."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
+    """Metadata and attachments that make a log self-contained."""
+    packages = ("hil-drive", "numpy", "scipy", "numba", "python-can", "mcap")
+    attachments = {
+        "config.toml": setup.path.read_text(encoding="utf-8"),
+        "config.json": setup.config.model_dump_json(),
+        "drive.dbc": setup.database.text,
+    }
+    if setup.config.emulator is not None:
+        plant = setup.path.parent / setup.config.emulator.plant
+        if plant.is_file():
+            attachments["plant.toml"] = plant.read_text(encoding="utf-8")
+    return {
+        "metadata": {
+            "kind": kind,
+            "clock": clock,
+            "started": datetime.now(UTC).isoformat(),
+            "commit": _git_commit(),
+            "python": sys.version.split()[0],
+            "machine": platform.machine(),
+            "kernel": platform.release(),
+            "wire": json.dumps(
+                {
+                    "u_lsb": setup.wire.u_lsb,
+                    "T_L_lsb": setup.wire.T_L_lsb,
+                    "counter_modulus": setup.wire.counter_modulus,
+                    "x_lsb": setup.wire.x_lsb,
+                    "u_top": setup.wire.u_top,
+                }
+            ),
+            **{f"version {name}": package_version(name) for name in packages},
+        },
+        "attachments": attachments,
+    }
+
+
+@contextlib.contextmanager
+def opened_client(setup: Setup, recorder: Recorder | None, clock: RealClock | LockstepClock) -> Iterator[DriveClient]:
+    """A drive client on the configured bus, closed in the end."""
+    link = open_link(bus_settings(setup.config))
+    client = DriveClient(
+        link,
+        setup.database,
+        load=setup.config.controller.kind == "fac",
+        on_frame=recorder.frame if recorder and setup.config.log.frames else ignore_frame,
+        now=clock.now_ns,
+    )
+    try:
+        yield client
+    finally:
+        client.close()
+
+
+def check_arming(setup: Setup, arm: bool) -> None:
+    """Refuse a real bus without an explicit ``--arm``."""
+    if arm or is_emulated_bus(setup.config):
+        return
+    bus = setup.config.bus
+    raise ArmingError(
+        f"{bus.interface}:{bus.channel} may carry a real drive: nothing was sent; "
+        "check with 'hil check', then arm with --arm"
+    )
+
+
+def needed_bytes(config: RunConfig) -> int:
+    """Disk space that a run of the configured length may take, at least one minute's."""
+    seconds = config.loop.duration_s or 60.0
+    return round(seconds * config.loop.rate_hz * BYTES_PER_TICK) + (8 << 20)
+
+
+def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
+    """Arm and run a configuration; returns after a safe stop. Raises HilError before anything is sent."""
+    check_arming(setup, arm)
+    request = request or StopRequest()
+    config = setup.config
+    setup.machine.warm_up()
+    path = log_path(setup, "run")
+    check_folder(path, needed_bytes(config))
+    clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
+    recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
+    try:
+        with opened_client(setup, recorder, clock) as client:
+            _await_drive(setup, client)
+            result = _run_armed(setup, client, recorder, clock, request)
+    except (LinkError, DriverError, HilError) as error:
+        recorder.close({"ended": f"refused: {error}"})
+        raise
+    return result
+
+
+def _await_drive(setup: Setup, client: DriveClient) -> None:
+    """Listen for the drive before anything is sent."""
+    timeout_s = setup.config.drive.heartbeat_timeout_s
+    if not client.wait_for_drive(timeout_s):
+        bus = setup.config.bus
+        hint = f"start it: hil emulate {setup.path}" if is_emulated_bus(setup.config) else "is it powered and wired?"
+        raise ArmingError(
+            f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, nothing was sent; {hint}"
+        )
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """Timing of the run."""
+    loop = config.loop
+    ticks = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
+    return Plan(loop.period_ns, loop.timeout_ns, loop.pacing, ticks)
+
+
+def _run_armed(
+    setup: Setup, client: DriveClient, recorder: Recorder, clock: RealClock | LockstepClock, request: StopRequest
+) -> RunResult:
+    machine, plan = setup.machine.fresh(), plan_of(setup.config)
+    loop = Loop(client, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)
+    grants: list[realtime.Grant] = []
+    outcome, failure = Outcome(), ""
+    try:
+        with stopping_on_signals(request):
+            client.discard()
+            if clock.name == "monotonic":
+                grants = realtime.acquire(setup.config.realtime)
+            outcome = loop.run()
+    except BaseException as error:
+        failure = f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        realtime.release()
+        dropped = recorder.dropped
+        ended = failure or Reason(outcome.reason).name.lower()
+        result = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
+        complete = recorder.close(result)
+    return RunResult(str(recorder.path), outcome, complete, dropped, grants)
+
+
+@contextlib.contextmanager
+def stopping_on_signals(request: StopRequest) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and SIGHUP ask for a safe stop; the old handlers come back afterwards."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, request.stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def with_clock(setup: Setup, clock: str) -> Setup:
+    """The same setup on another clock."""
+    loop = setup.config.loop.model_copy(update={"clock": clock})
+    return replace(setup, config=setup.config.model_copy(update={"loop": loop}))
+
+
+def wait_until(predicate: Any, timeout_s: float) -> bool:
+    """Poll ``predicate`` every 10 ms."""
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        if predicate():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def open_bus(config: RunConfig) -> Link:
+    """The configured bus as a raw link."""
+    return open_link(bus_settings(config))

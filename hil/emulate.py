@@ -1,0 +1,59 @@
+"""`hil emulate`: the emulated drive as a process of its own on the configured bus."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+from drivers.bus import open_link
+from drivers.codec import Database
+from firmware_model.config import PlantConfig, build_params
+from firmware_model.node import Node, wire_of
+from hil.app import Overrides, bus_settings
+from hil.config import RunConfig, load_toml
+from hil.errors import ConfigError
+
+
+def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None) -> tuple[PlantConfig, Path]:
+    """The plant that a run configuration names, and the folder of its file."""
+    if config.emulator is None:
+        raise ConfigError(str(path), ["emulator: missing; add [emulator] with plant = \"plants/demo.toml\""])
+    plant_path = path.parent / config.emulator.plant
+    return load_toml(plant_path, PlantConfig, settings or []), plant_path.parent
+
+
+def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tuple[Node, str]:
+    """Load everything, open the bus; return the node and a line that says what it is."""
+    config = load_toml(path, RunConfig, overrides.as_settings())
+    plant, folder = load_plant(path, config, plant_settings)
+    database = Database(folder / plant.dbc, plant.node_id)
+    params = build_params(plant, wire_of(database))
+    link = open_link(bus_settings(config))
+    node = Node(
+        link,
+        database,
+        params,
+        clock=config.loop.clock,
+        pacing=plant.pacing,
+        period_ns=config.loop.period_ns,
+        truth=plant.truth,
+    )
+    bus = config.bus
+    return node, f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {plant.motor.name or 'inline'}, {config.loop.clock}"
+
+
+def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
+    """Run the emulator until SIGINT or SIGTERM. Prints one line when it listens and one at the end."""
+    node, what = make_node(path, overrides, plant_settings)
+    node.warm_up()
+    stopped = False
+
+    def stop(*_: object) -> None:
+        nonlocal stopped
+        stopped = True
+
+    signal.signal(signal.SIGINT, stop)
+    signal.signal(signal.SIGTERM, stop)
+    print(f"emulator ready on {what}", flush=True)  # noqa: T201 - the line that callers wait for
+    node.run(lambda: stopped)
+    print(node.summary(), flush=True)  # noqa: T201

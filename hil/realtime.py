@@ -1,0 +1,74 @@
+"""What the operating system grants the loop: FIFO scheduling, locked memory, a core, a frozen collector.
+
+Nothing here fails: what is not granted is said, with what would grant it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+from dataclasses import dataclass
+
+from hil.config import RealtimeTable
+
+_MCL_CURRENT_AND_FUTURE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """One thing that was asked of the operating system."""
+
+    what: str
+    granted: bool
+    detail: str
+
+
+def acquire(table: RealtimeTable) -> list[Grant]:
+    """Ask for everything the config wants; return what came of it."""
+    return [*_fifo(table.fifo_priority), *_memory(table.lock_memory), *_core(table.cpu), freeze_collector()]
+
+
+def release() -> None:
+    """Give FIFO scheduling back, so that what follows the loop disturbs nobody."""
+    if os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+def _fifo(priority: int) -> list[Grant]:
+    if priority == 0:
+        return []
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except OSError as error:
+        remedy = f"add '@{os.getlogin() if os.isatty(0) else 'user'} - rtprio 98' to /etc/security/limits.d"
+        return [Grant("SCHED_FIFO", False, f"{error.strerror}; {remedy}")]
+    return [Grant("SCHED_FIFO", True, f"priority {priority}")]
+
+
+def _memory(wanted: bool) -> list[Grant]:
+    if not wanted:
+        return []
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT_AND_FUTURE) != 0:
+        detail = os.strerror(ctypes.get_errno()) + "; raise memlock in /etc/security/limits.d"
+        return [Grant("locked memory", False, detail)]
+    return [Grant("locked memory", True, "current and future pages")]
+
+
+def _core(cpu: int | None) -> list[Grant]:
+    if cpu is None:
+        return []
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except OSError as error:
+        return [Grant("core", False, f"core {cpu}: {error.strerror}; choose another [realtime] cpu")]
+    return [Grant("core", True, f"pinned to core {cpu}")]
+
+
+def freeze_collector() -> Grant:
+    """Collect once, move everything out of the collector's sight and switch it off for the run."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    return Grant("garbage collector", True, "frozen for the run")

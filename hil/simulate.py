@@ -1,0 +1,161 @@
+"""`hil simulate`: controller and emulated motor in one compiled loop, through the same wire resolution.
+
+It calls the very kernels that the loop and the emulator process call, in the order in which a lockstep bus
+delivers their frames, so its outputs equal those of a lockstep run to the bit.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.codec import Database
+from firmware_model.config import build_params, new_sample, new_state
+from firmware_model.drive import advance, on_command, on_load_command, on_sync
+from firmware_model.node import wire_of
+from hil.app import Setup, header_of, log_path, needed_bytes, plan_of
+from hil.control.jit import jit
+from hil.control.law import FAC
+from hil.emulate import load_plant
+from hil.errors import ConfigError
+from hil.kernel import prepare, step
+from hil.log.mcapfile import RunFile
+from hil.log.recorder import check_folder
+from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
+
+Record = npt.NDArray[np.void]
+BLOCK: Final = 4096
+
+
+@jit
+def receive(pp: Any, ps: Any, out: Any, t: Any) -> None:
+    """SYNC to the drive, its answer into the tick's inputs, as codec and client do it."""
+    o = out[0]
+    on_sync(pp[0], ps[0], o)
+    t["w"], t["i_q"], t["i_d"] = o["w"], o["i_q"], o["i_d"]
+    t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
+    t["rx_flags"] = RxFlag.FRESH.value
+    t["T_L_true"] = o["T_L_true"]
+    if o["emcy_due"]:
+        t["rx_flags"] |= RxFlag.EMERGENCY.value
+        t["drive_error"] = o["error"]
+    if o["status_due"]:
+        t["rx_flags"] |= RxFlag.STATUS.value
+        t["v_dc"], t["drive_error"] = o["v_dc"], o["error"]
+        t["temperature_motor"], t["temperature_inverter"] = o["temperature_motor"], o["temperature_inverter"]
+
+
+@jit
+def deliver(lp: Any, ps: Any, t: Any) -> None:
+    """The tick's command to the drive, as codec and node do it."""
+    if not t["send"]:
+        return
+    if lp[0]["kind"] == FAC:
+        on_load_command(ps[0], t["T_L"])
+    on_command(ps[0], t["counter"], t["controlword"], t["u_q"], t["u_d"])
+
+
+@jit
+def ended(t: Any) -> bool:
+    """As the loop decides it."""
+    done = t["state"] == DriveState.SWITCH_ON_DISABLED or t["state"] == DriveState.FAULT
+    return bool(done and t["reason"] != Reason.NONE)
+
+
+@jit
+def simulate_block(
+    sp: Any, ss: Any, lp: Any, ls: Any, rp: Any, pp: Any, ps: Any, out: Any, tick: Any, ticks: Any, k: int,
+    period_ns: int, stop_at: int
+) -> int:
+    """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended."""
+    t = tick[0]
+    for j in range(ticks.shape[0]):
+        if k + j > 0:
+            advance(pp[0], ps[0], period_ns)
+        t["k"] = k + j
+        t["t_ns"] = (k + j) * period_ns
+        t["gap"] = 1
+        t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
+        receive(pp, ps, out, t)
+        prepare(rp, ss, lp, tick)
+        step(sp, ss, lp, ls, tick)
+        deliver(lp, ps, t)
+        ticks[j] = tick[0]
+        if ended(t):
+            return j + 1
+    return ticks.shape[0]
+
+
+@dataclass(slots=True)
+class Simulation:
+    """A simulated run; :meth:`blocks` yields its ticks."""
+
+    setup: Setup
+    plant: Record
+    plant_state: Record
+    stop_at: int
+
+    def blocks(self) -> Any:
+        """Yield tick arrays of up to BLOCK ticks until the run has ended."""
+        machine, tick, out, k = self.setup.machine.fresh(), new_ticks(), new_sample(), 0
+        period_ns = self.setup.config.loop.period_ns
+        while True:
+            ticks = new_ticks(BLOCK)
+            count = simulate_block(
+                machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
+                self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
+            )  # fmt: skip
+            yield ticks[:count]
+            k += count
+            if count < BLOCK or _over(ticks[count - 1]):
+                return
+
+
+def _over(tick: Any) -> bool:
+    return bool(ended(tick))
+
+
+def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
+    """Load the plant of a setup. Raises ConfigError, also when the run has no length."""
+    ticks = plan_of(setup.config).ticks
+    if ticks is None:
+        raise ConfigError(str(setup.path), ["loop.duration_s: missing; a simulation must end"])
+    plant, folder = load_plant(setup.path, setup.config, plant_settings)
+    database = Database(folder / plant.dbc, plant.node_id)
+    params = build_params(plant, wire_of(database))
+    state = new_state(params, setup.wire.counter_modulus - 1)
+    return Simulation(setup, params, state, ticks)
+
+
+def simulate_ticks(setup: Setup, plant_settings: list[str] | None = None) -> TickArray:
+    """The whole simulated run in memory, without a log."""
+    return np.concatenate(list(make_simulation(setup, plant_settings or []).blocks()))
+
+
+def simulate(setup: Setup, plant_settings: list[str]) -> dict[str, Any]:
+    """Simulate, write the log, return the result for ``--json``."""
+    simulation = make_simulation(setup, plant_settings)
+    path = log_path(setup, "simulate")
+    check_folder(path, needed_bytes(setup.config))
+    start = time.perf_counter()
+    file = RunFile(path, header_of(setup, "simulate", "lockstep"))
+    last, count = new_ticks()[0], 0
+    for ticks in simulation.blocks():
+        file.add_ticks(ticks)
+        last, count = ticks[-1].copy(), count + len(ticks)
+    reason = Reason(int(last["reason"])).name.lower()
+    file.finish({"ended": reason, "ticks": count, "skipped": 0})
+    wall_s = time.perf_counter() - start
+    simulated_s = count * setup.config.loop.period_ns * 1e-9
+    return {
+        "log": str(path),
+        "ticks": count,
+        "ended": reason,
+        "ok": int(last["reason"]) == Reason.STOP_REQUESTED,
+        "simulated_s": simulated_s,
+        "x_realtime": simulated_s / wall_s,
+    }
