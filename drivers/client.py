@@ -64,6 +64,7 @@ class DriveClient:
         self._last_sent = 0
         self._pending_flags = 0
         self._down = False
+        self._late = False
         self._prepare(database)
 
     def _prepare(self, database: Database) -> None:
@@ -91,8 +92,14 @@ class DriveClient:
         """The command's message."""
         return self._command
 
-    def sync(self) -> None:
-        """Send SYNC with its counter 1..240."""
+    def sync(self, tick: Any) -> None:
+        """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
+        self._late = True
+        self.receive(tick, 0)
+        self._late = False
+        self._send_sync()
+
+    def _send_sync(self) -> None:
         self._sync_counter = self._sync_counter % 240 + 1
         self._send(self._sync_id, bytes((self._sync_counter,)), False)
 
@@ -135,6 +142,8 @@ class DriveClient:
         last, self._last_counter = self._last_counter, int(counter)
         if counter == last:
             return COUNTER_REPEATED
+        if self._late:
+            return 0
         tick["w"], tick["i_q"], tick["i_d"] = w, i_q, i_d
         tick["echo"], tick["drive_state"], tick["limited"] = echo, state, limited
         if self._status_inside:
@@ -204,7 +213,7 @@ class DriveClient:
             self._last_sent = (self._last_sent + 1) % modulus
             try:
                 self._send_command(self._last_sent, 0, 0.0, 0.0, 0.0)
-                self.sync()
+                self._send_sync()
             except LinkError:
                 return
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from drivers.bus import open_link
+from drivers.bus import Link, open_link
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
@@ -22,7 +22,7 @@ def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None)
     return load_toml(plant_path, PlantConfig, settings or []), plant_path.parent
 
 
-def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tuple[Node, str]:
+def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tuple[Node, Link, str]:
     """Load everything, open the bus; return the node and a line that says what it is."""
     config = load_toml(path, RunConfig, overrides.as_settings())
     plant, folder = load_plant(path, config, plant_settings)
@@ -39,12 +39,13 @@ def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tu
         truth=plant.truth,
     )
     bus = config.bus
-    return node, f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {plant.motor.name or 'inline'}, {config.loop.clock}"
+    what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {plant.motor.name or 'inline'}, {config.loop.clock}"
+    return node, link, what
 
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     """Run the emulator until SIGINT or SIGTERM. Prints one line when it listens and one at the end."""
-    node, what = make_node(path, overrides, plant_settings)
+    node, link, what = make_node(path, overrides, plant_settings)
     node.warm_up()
     stopped = False
 
@@ -55,5 +56,8 @@ def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
     print(f"emulator ready on {what}", flush=True)  # noqa: T201 - the line that callers wait for
-    node.run(lambda: stopped)
+    try:
+        node.run(lambda: stopped)
+    finally:
+        link.close()
     print(node.summary(), flush=True)  # noqa: T201

@@ -66,6 +66,7 @@ def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
         return
     if not (t["rx_flags"] & RxFlag.FRESH and ls["started"]):
         t["u_q_law"], t["u_d_law"], t["T_L_law"] = s["u_q"], s["u_d"], s["T_L"]
+        t["i_q_ref"] = ls["i_q_ref"]
         return
     command(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], voltage_limit(p, s))
     t["T_L_law"], t["u_q_law"], t["u_d_law"] = ls["u"][0], ls["u"][1], ls["u"][2]
@@ -75,9 +76,8 @@ def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 @jit
 def remember(p: Any, s: Any, t: Any) -> None:
     """Number the command and keep it until the drive echoes its number."""
-    if not t["send"]:
-        return
-    s["counter"] = (s["counter"] + 1) % p["counter_modulus"]
+    if t["send"]:
+        s["counter"] = (s["counter"] + 1) % p["counter_modulus"]
     t["counter"] = s["counter"]
     s["sent_q"][s["counter"]], s["sent_d"][s["counter"]] = t["u_q"], t["u_d"]
     s["sent_T"][s["counter"]] = t["T_L"]

@@ -141,7 +141,7 @@ class Loop:
             return
         if plan.pacing == "sync":
             try:
-                drive.sync()
+                drive.sync(tick)
             except OSError:
                 tick["rx_flags"] |= int(RxFlag.BUS_DOWN)
                 return

@@ -13,8 +13,11 @@ from hil.signals import TickArray
 class Drive(Protocol):
     """A drive on a bus. ``tick`` is one record of :data:`hil.signals.TICK`, filled in place."""
 
-    def sync(self) -> None:
-        """Send SYNC: the drive latches the newest command, samples and answers with its feedback."""
+    def sync(self, tick: Any) -> None:
+        """Send SYNC: the drive latches the newest command, samples and answers with its feedback.
+
+        What arrived since the last tick is taken first; feedback among it is late and not applied.
+        """
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Drain the bus until this tick's feedback came or ``deadline_ns`` (monotonic) passed.

@@ -1,0 +1,115 @@
+"""`hil demo`: emulator process, armed loop, load step, stop, replay, and a table of what happened."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from firmware_model.config import PlantMotor
+from hil.app import Overrides, RunResult, Setup, load_setup, run
+from hil.control.law import MotorModel, law_window, sampled_model
+from hil.control.observer import bounds
+from hil.design import law_spec, motor_model
+from hil.emulate import load_plant
+from hil.errors import HilError
+from hil.log.reader import open_log
+from hil.metrics import Lateness, LoadStep, load_step, tracking_rms
+from hil.replay import Verdict, replay_log
+from hil.signals import TickArray
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+__all__ = ["demo", "emulator_process", "find_config", "resolution_bound"]
+
+
+def find_config(name: str) -> Path:
+    """A shipped configuration: in the working directory's configs/, else beside the package."""
+    for folder in (Path("configs"), CONFIGS):
+        if (folder / name).is_file():
+            return folder / name
+    raise HilError(f"configs/{name}: not found; run from the project's folder or pass a configuration")
+
+
+@contextlib.contextmanager
+def emulator_process(path: Path, overrides: Overrides, plant_settings: tuple[str, ...] = ()) -> Iterator[int]:
+    """The emulator of a config as a process; yields its pid once it listens, ends it afterwards."""
+    command = [sys.executable, "-m", "hil.cli", "emulate", str(path)]
+    for setting in overrides.as_settings():
+        command += ["--set", setting]
+    for setting in plant_settings:
+        command += ["--plant-set", setting]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)  # noqa: S603
+    assert process.stdout is not None  # noqa: S101 - PIPE was asked for
+    try:
+        line = process.stdout.readline()
+        if not line.startswith("emulator ready"):
+            raise HilError(f"the emulator can't start: {line.strip() or 'see its message above'}")
+        yield process.pid
+    finally:
+        process.terminate()
+        try:
+            process.communicate(timeout=10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+
+def resolution_bound(setup: Setup) -> float:
+    """Largest error of d_hat_w [rad/s2] that the resolution of the frames alone can cause."""
+    spec = law_spec(setup.config)
+    T_s = 1.0 / setup.config.loop.rate_hz
+    model = sampled_model(motor_model(setup.config.motor), T_s)
+    limits = bounds(law_window(spec, T_s), model.Ad, model.Ed, T_s, list(setup.wire.x_lsb))
+    return float(limits.resolution[0])
+
+
+def summary(setup: Setup, ticks: TickArray, result: RunResult, verdict: Verdict, true: MotorModel) -> dict[str, Any]:
+    """The demo's result, as ``--json`` prints it."""
+    N = int(setup.machine.law["N"][0, 0])
+    step: LoadStep | None = load_step(ticks, N, motor_model(setup.config.motor), true)
+    return {
+        "log": result.log,
+        "ticks": result.outcome.ticks,
+        "skipped": result.outcome.skipped,
+        "dropped": result.dropped,
+        "ended": result.as_dict()["ended"],
+        "lateness_us": asdict(Lateness.of(ticks)),
+        "tracking_rms_rad_s": tracking_rms(ticks),
+        "dip_rad_s": step.dip if step else None,
+        "recovery_ms": step.recovery_ms if step else None,
+        "estimate_error_after_n": step.estimate_error if step else None,
+        "estimate_step_rad_s2": step.step if step else None,
+        "estimate_bound_rad_s2": resolution_bound(setup),
+        "n": N,
+        "grants": [asdict(grant) for grant in result.grants],
+        "replay": verdict.as_dict(),
+    }
+
+
+def true_motor(motor: PlantMotor) -> MotorModel:
+    """The emulator's motor in the controller's terms."""
+    return MotorModel(
+        motor.R_s_ohm, motor.L_d_h, motor.L_q_h, motor.psi_f_wb, motor.n_p, motor.J_kg_m2, motor.B_f_n_m_s
+    )
+
+
+def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
+    """Run the demo; raises HilError with one clear line."""
+    path = path or find_config("demo.toml")
+    if overrides.channel is None:
+        overrides = Overrides(
+            overrides.interface, f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}", overrides.bitrate, overrides.fd,
+            overrides.settings,
+        )  # fmt: skip
+    setup = load_setup(path, overrides)
+    plant, _ = load_plant(path, setup.config)
+    with emulator_process(path, overrides):
+        result = run(setup)
+    log = open_log(Path(result.log))
+    return summary(setup, log.ticks, result, replay_log(log), true_motor(plant.motor))

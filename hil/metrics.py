@@ -1,0 +1,107 @@
+"""What a run achieved, from its ticks: tracking, dip and recovery, estimate error, lateness."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.control.law import MotorModel
+from hil.signals import DriveState, TickArray
+
+RECOVERED_RAD_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Lateness:
+    """Percentiles of the wake-up after the deadline [us]."""
+
+    p50: float
+    p99: float
+    p999: float
+    max: float
+
+    @classmethod
+    def of(cls, ticks: TickArray) -> Lateness:
+        """Of all ticks; zeros for none."""
+        if len(ticks) == 0:
+            return cls(0.0, 0.0, 0.0, 0.0)
+        late = ticks["lateness_ns"] * 1e-3
+        p50, p99, p999 = np.percentile(late, [50, 99, 99.9])
+        return cls(float(p50), float(p99), float(p999), float(late.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class LoadStep:
+    """Response to a step of the true load torque.
+
+    ``dip`` [rad/s]: largest speed error after it; ``recovery_ms``: from the step until the error stays below
+    0.5 rad/s; ``estimate_error`` [rad/s2]: |d_hat_w - d_w| N ticks after the step, d_w the true one of the
+    period that the newest innovation covers; ``step`` [rad/s2]: what the load alone adds to d_w.
+    """
+
+    k: int
+    dip: float
+    recovery_ms: float
+    estimate_error: float
+    step: float
+
+
+def operating(ticks: TickArray) -> TickArray:
+    """Ticks in which operation is enabled."""
+    return ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
+
+
+def tracking_rms(ticks: TickArray) -> float:
+    """RMS of w - w* over the ticks in operation [rad/s]."""
+    own = operating(ticks)
+    if len(own) == 0:
+        return float("nan")
+    error: Any = own["w"] - own["w_ref"]
+    return float(np.sqrt(np.mean(error * error)))
+
+
+def find_step(ticks: TickArray, at_least: float = 0.5) -> int | None:
+    """Row of the largest jump of the true load torque [N m] between two ticks, None for none."""
+    if len(ticks) < 2:
+        return None
+    jump = np.abs(np.diff(ticks["T_L_true"]))
+    if not np.isfinite(jump).any():
+        return None
+    row = int(np.nanargmax(jump)) + 1
+    return row if jump[row - 1] >= at_least else None
+
+
+def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -> npt.NDArray[np.float64]:
+    """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed linear model's."""
+    w, i_q, i_d = ticks["w"], ticks["i_q"], ticks["i_d"]
+    torque = 1.5 * true.n_p * (true.psi_f + (true.L_d - true.L_q) * i_d) * i_q
+    real = (torque - ticks["T_L_true"] - true.B_f * w) / true.J
+    out: npt.NDArray[np.float64] = real - (believed.k_t * i_q - believed.B_f * w) / believed.J
+    return out
+
+
+def load_step(ticks: TickArray, N: int, believed: MotorModel, true: MotorModel) -> LoadStep | None:
+    """Judge the response to the largest load step; N is the window of the speed channel [ticks]."""
+    row = find_step(ticks)
+    if row is None or row < 50 or row + N + 1 >= len(ticks):
+        return None
+    end = _until(ticks, row)
+    error = ticks["w"][row:end] - ticks["w_ref"][row:end]
+    outside = np.nonzero(np.abs(error) > RECOVERED_RAD_S)[0]
+    period_ms = float(np.median(np.diff(ticks["t_ns"][row:end]))) * 1e-6
+    recovery = (int(outside[-1]) + 1) * period_ms if len(outside) else 0.0
+    true_step = -float(ticks["T_L_true"][row] - ticks["T_L_true"][row - 1]) / true.J
+    d_w = true_disturbance(ticks[row + N - 1 : row + N + 1], believed, true)
+    estimate_error = abs(float(ticks["d_hat_w"][row + N]) - float(d_w[0]))
+    return LoadStep(int(ticks["k"][row]), float(np.abs(error).max()), recovery, estimate_error, true_step)
+
+
+def _until(ticks: TickArray, row: int) -> int:
+    """First row after ``row`` at which the load or the reference changes again."""
+    load = np.abs(np.diff(ticks["T_L_true"][row:])) > 0.5
+    moving = np.abs(ticks["dw_ref"][row + 1 :]) > 0
+    changed = np.nonzero(load | moving | (ticks["state"][row + 1 :] != ticks["state"][row]))[0]
+    return row + 1 + int(changed[0]) if len(changed) else len(ticks)

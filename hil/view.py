@@ -1,0 +1,96 @@
+"""Tables on the terminal; plain lines where standard output is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from hil.app import RunResult
+from hil.replay import Verdict
+from hil.signals import Reason
+
+
+def show(table: Table) -> None:
+    """Print a table, never narrower than its paths need when the output is no terminal."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=160)
+    console.print(table)
+
+
+def key_values(title: str, values: dict[str, Any]) -> Table:
+    """A two-column table."""
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    for key, value in values.items():
+        table.add_row(key, _text(value))
+    return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return str(value)
+
+
+def _number(value: float | None, unit: str, digits: int = 2) -> str:
+    return "-" if value is None else f"{value:.{digits}f} {unit}"
+
+
+def demo_table(result: dict[str, Any]) -> Table:
+    """What the demo shows at its end."""
+    late, replay = result["lateness_us"], result["replay"]
+    step = result["estimate_step_rad_s2"]
+    rows = {
+        "tracking error": _number(result["tracking_rms_rad_s"], "rad/s rms"),
+        "load step": "-" if step is None else f"{step:.0f} rad/s2 in d_w (seen by nobody but the emulator)",
+        "speed dip": _number(result["dip_rad_s"], "rad/s"),
+        "recovery to 0.5 rad/s": _number(result["recovery_ms"], "ms", 0),
+        f"estimate error after N = {result['n']} ticks": (
+            f"{_number(result['estimate_error_after_n'], 'rad/s2')} "
+            f"(frame resolution alone: up to {result['estimate_bound_rad_s2']:.2f})"
+        ),
+        "ticks": f"{result['ticks']}, {result['skipped']} skipped, {result['dropped']} records dropped",
+        "lateness": " / ".join(f"{late[key]:.0f}" for key in ("p50", "p99", "p999", "max"))
+        + " us (p50 / p99 / p99.9 / max)",
+        "granted": ", ".join(f"{g['what']}: {g['detail'] if g['granted'] else 'no, ' + g['detail']}" for g in result["grants"])
+        or "nothing asked (lockstep)",
+        "ended": result["ended"],
+        "replay": verdict_text(replay),
+        "log": result["log"],
+    }
+    return key_values("hil demo", rows)
+
+
+def verdict_text(replay: dict[str, Any]) -> str:
+    """A verdict in one line."""
+    first = replay["first_difference"]
+    text = {"same": f"same to the bit, {replay['ticks']} ticks", "cannot": "cannot"}.get(replay["verdict"], "differs")
+    if first:
+        text += (
+            f" from tick {first['tick']} on: {first['field']} logged {first['logged']}, "
+            f"replayed {first['replayed']} ({first['ulp']} ulp)"
+        )
+    return text + (f"; {replay['why']}" if replay["why"] else "")
+
+
+def run_table(result: RunResult) -> Table:
+    """What a run says at its end."""
+    rows: dict[str, Any] = {
+        "ended": Reason(result.outcome.reason).name.lower().replace("_", " "),
+        "ticks": f"{result.outcome.ticks}, {result.outcome.skipped} skipped",
+        "records dropped": result.dropped,
+    }
+    for grant in result.grants:
+        rows[grant.what] = grant.detail if grant.granted else f"not granted: {grant.detail}"
+    rows["log"] = result.log + ("" if result.complete else " (incomplete)")
+    return key_values("hil run", rows)
+
+
+def replay_table(log: Path, verdict: Verdict) -> Table:
+    """What a replay found."""
+    return key_values("hil replay", {"log": log, "verdict": verdict_text(verdict.as_dict())})
