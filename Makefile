@@ -1,0 +1,42 @@
+# Two commands do all the set-up: `make demo` and `make test`. No root, no network but the package index.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/numba
+JITTED := tests/unit tests/property tests/contract
+COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
+
+.PHONY: demo test lint unit interpreted vm clean help
+
+help: ## show what there is
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: $(STAMP) ## close the loop against the emulated drive, step the load, replay the log
+	$(BIN)/hil demo
+
+test: $(STAMP) lint unit interpreted ## everything that must be green
+
+lint: $(STAMP) ## ruff and mypy
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+unit: $(STAMP) ## all tests, compiled
+	$(BIN)/python -m pytest
+
+# The same kernels with the compiler off: line and branch coverage can see into them.
+interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -m "not process and not vm and not compiled" $(JITTED) \
+	    $(COVER) --cov-branch --cov-report=term-missing:skip-covered --cov-fail-under=90
+
+vm: $(STAMP) ## the tests on a real SocketCAN bus (natively or in the bench machine)
+	HIL_REQUIRE_VM=1 $(BIN)/python -m pytest -m vm tests/vm
+
+clean: ## remove the virtual environment and caches
+	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis
