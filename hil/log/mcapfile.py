@@ -1,87 +1,187 @@
-"""Writing MCAP: channels, schemas, metadata and attachments of a run, over the mcap package's writer."""
+"""One run as an MCAP file: topics, metadata, attachments. Used by the writer process and by `hil simulate`.
+
+Ticks have chunks of their own, so that they are read and written as one array; frames, events and
+statistics share theirs.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import os
 from pathlib import Path
-from typing import IO, Any
+from types import TracebackType
+from typing import Any, Final, Self
 
-from mcap.writer import CompressionType, Writer
+import numpy as np
+import numpy.typing as npt
 
-from hil.log.schema import TOPICS, file_descriptor_set, meanings, pack_event, pack_stats, units
-from hil.signals import TickArray
+from hil.log.container import FIXED_BYTES, HEAD_BYTES, MESSAGE_HEAD, Block, Container, Integers
+from hil.log.schema import (
+    FRAME,
+    FRAME_HEAD,
+    FRAME_MESSAGE,
+    TOPICS,
+    Records,
+    file_descriptor_set,
+    frame_messages,
+    meanings,
+    pack_event,
+    pack_stats,
+    units,
+)
+from hil.signals import TICK, TickArray
 
-CHUNK_BYTES = 256 * 1024
-LIBRARY = "hil-drive"
+Column = npt.NDArray[Any] | int
+
+CHUNK_BYTES: Final = 256 * 1024
+MESSAGE: Final = 5
+HEAD: Final = np.dtype(MESSAGE_HEAD)
+TICK_MESSAGE: Final = np.dtype([*MESSAGE_HEAD, ("data", f"V{TICK.itemsize}")])
+_FRAME_MESSAGE: Final = np.dtype([*MESSAGE_HEAD, ("data", FRAME_MESSAGE)])
 
 
 class RunFile:
-    """One MCAP file of a run."""
+    """A run's file. Raises OSError when it can't be written; what was written before stays readable."""
 
     def __init__(self, path: Path, header: dict[str, Any], chunk_bytes: int = CHUNK_BYTES) -> None:
-        fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600)
-        self._file: IO[bytes] = os.fdopen(fd, "wb")
-        self._writer = Writer(self._file, chunk_size=chunk_bytes, compression=CompressionType.ZSTD)
-        self._writer.start(profile="", library=LIBRARY)
-        descriptors = file_descriptor_set().SerializeToString()
-        schemas = {
-            name: self._writer.register_schema(name=name, encoding="protobuf", data=descriptors)
-            for name in sorted(set(TOPICS.values()))
-        }
-        self._channels = {
-            topic: self._writer.register_channel(topic=topic, message_encoding="protobuf", schema_id=schemas[name])
-            for topic, name in TOPICS.items()
-        }
-        self._describe(header)
+        self._out = Container(path)
+        self._limit = chunk_bytes
+        self._ticks, self._others = Block(), Block()
         self.ticks = self.frames = 0
-        self.flush()
+        try:
+            self._open(header)
+        except OSError:
+            self._out.close()
+            raise
 
-    def _describe(self, header: dict[str, Any]) -> None:
-        """Metadata ``run``, ``units``, ``meanings`` and the attachments of the run."""
-        self._writer.add_metadata("run", {str(k): str(v) for k, v in header.get("metadata", {}).items()})
-        self._writer.add_metadata("units", units())
-        self._writer.add_metadata("meanings", meanings())
+    def _open(self, header: dict[str, Any]) -> None:
+        """Schemas and channels, then metadata ``run``, ``units``, ``meanings`` and the run's attachments."""
+        descriptors = file_descriptor_set().SerializeToString()
+        schemas = {name: self._out.add_schema(name, descriptors) for name in sorted(set(TOPICS.values()))}
+        self._channels = {
+            topic: self._out.add_channel(topic, schemas[name]) for topic, name in TOPICS.items()
+        }
+        self._out.add_metadata("run", {str(k): str(v) for k, v in header.get("metadata", {}).items()})
+        self._out.add_metadata("units", units())
+        self._out.add_metadata("meanings", meanings())
         for name, text in header.get("attachments", {}).items():
-            self._writer.add_attachment(0, 0, name, "text/plain", text.encode())
+            self._out.add_attachment(name, text.encode())
+
+    @property
+    def size(self) -> int:
+        """Bytes in the file so far."""
+        return self._out.size
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """Write metadata of another name."""
+        self._out.add_metadata(name, values)
 
     def add_ticks(self, ticks: TickArray) -> None:
-        """Append tick records."""
-        channel, add, size = self._channels["/tick"], self._writer.add_message, ticks.itemsize
-        raw = ticks.tobytes()
-        rows = zip(ticks["k"].tolist(), ticks["t_ns"].tolist(), range(0, len(raw), size), strict=True)
-        for k, t_ns, at in rows:
-            add(channel, t_ns, raw[at : at + size], t_ns, k & 0xFFFFFFFF)
+        """Append tick records (any number)."""
+        per_chunk = max(1, self._limit // TICK_MESSAGE.itemsize)
+        for at in range(0, len(ticks), per_chunk):
+            self._add_ticks(ticks[at : at + per_chunk])
         self.ticks += len(ticks)
 
-    def add_frame(self, received: bool, t_ns: int, raw: bytes, sequence: int) -> None:
-        """Append one encoded CAN frame."""
-        self._writer.add_message(self._channels["/can/rx" if received else "/can/tx"], t_ns, raw, t_ns, sequence)
-        self.frames += 1
+    def _add_ticks(self, ticks: TickArray) -> None:
+        messages = np.empty(len(ticks), TICK_MESSAGE)
+        self._head(messages, self._channels["/tick"], ticks["t_ns"], ticks["k"] & 0xFFFFFFFF)
+        messages["length"] = FIXED_BYTES + TICK.itemsize
+        messages["data"] = np.ascontiguousarray(ticks).view(f"V{TICK.itemsize}")
+        lengths = np.full(len(ticks), TICK_MESSAGE.itemsize, np.int64)
+        self._ticks.add(messages["channel"].astype(np.int64), ticks["t_ns"], lengths, messages.tobytes())
+        if self._ticks.size + TICK_MESSAGE.itemsize > self._limit:
+            self._ticks = self._close(self._ticks)
+
+    @staticmethod
+    def _head(messages: Records, channels: Column, times: Column, sequence: Column) -> None:
+        """Fill in what every message has; publish_time is log_time, the deadline or the receive stamp."""
+        messages["opcode"] = MESSAGE
+        messages["channel"], messages["sequence"] = channels, sequence
+        messages["log_time"] = messages["publish_time"] = times
+
+    def add_frames(self, frames: Records) -> None:
+        """Append FRAME records (any number)."""
+        per_chunk = max(1, self._limit // _FRAME_MESSAGE.itemsize)
+        for at in range(0, len(frames), per_chunk):
+            self._add_frames(frames[at : at + per_chunk])
+
+    def _add_frames(self, frames: Records) -> None:
+        """Messages of full width are made at once, then the bytes after each frame's end are left out."""
+        messages = np.empty(len(frames), _FRAME_MESSAGE)
+        rx, tx = self._channels["/can/rx"], self._channels["/can/tx"]
+        channels = np.where(frames["received"] != 0, rx, tx).astype(np.int64)
+        sequence = np.arange(self.frames, self.frames + len(frames)) & 0xFFFFFFFF
+        self._head(messages, channels, frames["t_ns"], sequence)
+        size = np.minimum(frames["size"], FRAME["data"].shape[0]).astype(np.int64)
+        messages["length"] = FIXED_BYTES + FRAME_HEAD + size
+        messages["data"] = frame_messages(frames)
+        lengths = HEAD_BYTES + FRAME_HEAD + size
+        wide = messages.view(np.uint8).reshape(len(frames), -1)
+        raw = wide[np.arange(wide.shape[1])[None, :] < lengths[:, None]].tobytes()
+        self._add_others(channels, frames["t_ns"], lengths, raw)
+        self.frames += len(frames)
+
+    def _add_others(self, channels: Integers, times: Integers, lengths: Integers, raw: bytes) -> None:
+        self._others.add(channels, times, lengths, raw)
+        if self._others.size > self._limit:
+            self._others = self._close(self._others)
+
+    def _add_one(self, topic: str, t_ns: int, data: bytes) -> None:
+        head = np.empty(1, HEAD)
+        self._head(head, self._channels[topic], t_ns, 0)
+        head["length"] = FIXED_BYTES + len(data)
+        channel, time, length = (
+            np.array([value], np.int64) for value in (self._channels[topic], t_ns, HEAD_BYTES + len(data))
+        )
+        self._add_others(channel, time, length, head.tobytes() + data)
 
     def add_event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Append one event."""
-        self._writer.add_message(self._channels["/event"], t_ns, pack_event(t_ns, k, kind, text), t_ns)
+        self._add_one("/event", t_ns, pack_event(t_ns, k, kind, text))
 
-    def add_stats(self, t_ns: int, dropped: int, high_water: int) -> None:
-        """Append the writer's own figures."""
-        raw = pack_stats(t_ns, self.ticks, dropped, high_water, self.frames)
-        self._writer.add_message(self._channels["/stats"], t_ns, raw, t_ns)
+    def add_stats(self, t_ns: int, values: dict[str, int]) -> None:
+        """Append the writer's own figures, named as in :mod:`hil.log.schema`."""
+        self._add_one("/stats", t_ns, pack_stats(t_ns, values))
+
+    def _close(self, block: Block) -> Block:
+        """Write a block if there is anything in it; return an empty one."""
+        if block.count:
+            self._out.add_chunk(block)
+        return Block()
 
     def flush(self) -> None:
-        """Hand closed chunks to the operating system."""
-        self._file.flush()
+        """Close the chunks in the making and hand them to the operating system."""
+        self._ticks = self._close(self._ticks)
+        self._others = self._close(self._others)
 
     def finish(self, result: dict[str, Any]) -> None:
-        """Write result, summary and footer; close."""
+        """Write what is left, metadata ``result``, summary and footer; close."""
         try:
-            self._writer.add_metadata("result", {"result": json.dumps(result, allow_nan=True)})
-            self._writer.finish()
-        finally:
-            self._file.close()
+            self.flush()
+            self._seal(result)
+        except OSError:
+            self._out.close()
+            raise
 
-    def abandon(self) -> None:
-        """Close what can't be written any more; what was buffered is lost."""
+    def _seal(self, result: dict[str, Any]) -> None:
+        self._out.add_metadata("result", {"result": json.dumps(result, allow_nan=True)})
+        self._out.finish()
+
+    def abandon(self, why: str) -> None:
+        """After a failed write: leave out what couldn't be written, finish the file if that still goes."""
         with contextlib.suppress(OSError):
-            self._file.close()
+            self._seal({"ended": why})
+        self._out.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        """Leaving through an exception still leaves a complete file that names it."""
+        if error is not None:
+            self.abandon(f"{type(error).__name__}: {error}")
+        else:
+            self._out.close()

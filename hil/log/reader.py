@@ -1,35 +1,43 @@
-"""A tolerant reader: everything that a file holds up to its damage, and what is missing.
+"""A tolerant reader: everything that a log holds, around and up to its damage, and what is missing.
 
-Works chunk by chunk with bounded memory. Sizes are checked before anything is allocated, so that a file from
-a stranger is refused instead of exhausting memory.
+:func:`read_blocks` goes through a file of any length with bounded memory; :func:`open_log` keeps what it
+yields. A chunk that is damaged is left out and named, and reading goes on behind it.
 """
 
 from __future__ import annotations
 
 import json
-import struct
-import zlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Metadata, Schema, Statistics
-from mcap.stream_reader import StreamReader
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema
 
-from hil.control.jit import jit
-from hil.log.recorder import LogError
-from hil.log.schema import TOPICS, file_descriptor_set, unpack_can_frame
+from hil.log.container import FIXED_BYTES, LIBRARY
+from hil.log.errors import DamagedError, LogError
+from hil.log.mcapfile import MESSAGE, TICK_MESSAGE
+from hil.log.scan import Raw, chunk_content, chunk_rows, parse, parse_attachment, raw_records
+from hil.log.schema import (
+    FRAME_HEAD,
+    FRAME_MESSAGE,
+    TOPICS,
+    Records,
+    file_descriptor_set,
+    frames_from_messages,
+    message_layout,
+    unpack_event,
+)
 from hil.signals import TICK, TickArray, new_ticks
 
-MAX_CHUNK: Final = 64 << 20
-MAX_RECORD: Final = 64 << 20
-MESSAGE_HEADER: Final = 31
-_DAMAGE = (McapError, EOFError, ValueError, struct.error, zstandard.ZstdError, KeyError, UnicodeDecodeError)
+__all__ = ["Frame", "Log", "LogError", "open_log", "read_blocks"]
+
+Rows = npt.NDArray[np.int64]
+MEMORY_SHARE: Final = 0.5
 
 
 class Frame(NamedTuple):
@@ -39,6 +47,13 @@ class Frame(NamedTuple):
     t_ns: int
     can_id: int
     data: bytes
+
+
+class Block(NamedTuple):
+    """What one chunk brought: tick records or FRAME records of one direction."""
+
+    kind: Literal["ticks", "frames"]
+    records: Records
 
 
 @dataclass(slots=True)
@@ -52,12 +67,18 @@ class Log:
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, str] = field(default_factory=dict)
     damage: str | None = None
+    bytes_lost: int = 0
+    tick_count: int = 0
+    last_t_ns: int | None = None
 
     @property
     def result(self) -> dict[str, Any]:
         """The run's result, empty when the run did not end properly."""
-        out: dict[str, Any] = json.loads(self.metadata.get("result", {}).get("result", "{}"))
-        return out
+        try:
+            out = json.loads(self.metadata.get("result", {}).get("result", "{}"))
+        except ValueError:
+            return {}
+        return out if isinstance(out, dict) else {}
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
@@ -70,163 +91,208 @@ class Log:
         return [(int(k[i]), int(missing[i])) for i in at]
 
 
-@jit
-def scan(data: npt.NDArray[np.uint8], out: npt.NDArray[np.int64]) -> int:
-    """Find the records of a chunk: rows of (opcode, start of content, length); return how many are whole."""
-    at, count, size = 0, 0, data.shape[0]
-    while at + 9 <= size and count < out.shape[0]:
-        length = 0
-        for byte in range(8):
-            length |= np.int64(data[at + 1 + byte]) << (8 * byte)
-        if length < 0 or at + 9 + length > size:
-            break
-        out[count, 0], out[count, 1], out[count, 2] = data[at], at + 9, length
-        count += 1
-        at += 9 + length
-    return count
-
-
-def _content(chunk: Chunk) -> bytes:
-    """Uncompressed content of a chunk, its size and CRC checked."""
-    if chunk.uncompressed_size > MAX_CHUNK:
-        raise LogError(f"a chunk claims {chunk.uncompressed_size} bytes; this is no log of hil")
-    if chunk.compression == "zstd":
-        data = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
-    elif chunk.compression == "":
-        data = chunk.data
-    else:
-        raise LogError(f"compression {chunk.compression!r} is not one of a log of hil")
-    if len(data) != chunk.uncompressed_size:
-        raise ValueError("chunk size does not fit")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("chunk CRC does not fit")
-    return data
-
-
 class _Pass:
-    """One pass over a file: dispatches records, keeps what is wanted."""
+    """One pass over a file: fills in a log and yields blocks."""
 
-    def __init__(self, log: Log, frames: bool) -> None:
-        self.log, self._frames = log, frames
+    def __init__(self, log: Log) -> None:
+        self.log = log
         self._schemas: dict[int, Schema] = {}
         self._topics: dict[int, str] = {}
-        self.blocks: list[TickArray] = []
-        self.complete = False
+        self._tick_channel = -1
+        self.ours = self.complete = False
+        self.problems: list[str] = []
 
-    def take(self, record: Any) -> None:
-        if isinstance(record, Chunk):
-            self._chunk(_content(record))
+    def take(self, raw: Raw) -> Iterator[Block]:
+        """What a record of the file brings; one that is damaged is named and left out."""
+        try:
+            if raw.opcode == Opcode.ATTACHMENT:
+                name, data = parse_attachment(raw.content)
+                self.log.attachments[name] = data.decode(errors="replace")
+            else:
+                record = parse(raw.opcode, raw.content)
+                if isinstance(record, Chunk):
+                    yield from self._chunk(chunk_content(record))
+                elif record is not None:
+                    self._define(record)
+        except DamagedError as error:
+            self.problems.append(f"{error} (at byte {raw.offset})")
+            self.log.bytes_lost += len(raw.content)
+
+    def _define(self, record: McapRecord) -> None:
+        if isinstance(record, Header):
+            self.ours = record.library.startswith(LIBRARY)
         elif isinstance(record, Schema):
             self._schemas[record.id] = record
         elif isinstance(record, Channel):
             self._channel(record)
         elif isinstance(record, Metadata):
             self.log.metadata[record.name] = dict(record.metadata)
-        elif isinstance(record, Attachment):
-            self.log.attachments[record.name] = record.data.decode()
-        elif isinstance(record, (DataEnd, Statistics)):
+        elif isinstance(record, Footer):
             self.complete = True
 
     def _channel(self, channel: Channel) -> None:
         """Learn a channel; a topic of ours with another schema is another program's or version's."""
-        schema = self._schemas.get(channel.schema_id)
-        wanted = TOPICS.get(channel.topic)
-        if wanted is not None and (schema is None or schema.name != wanted):
-            raise LogError(f"{self.log.path}: topic {channel.topic} has not the schema {wanted}")
-        if channel.topic == "/tick" and schema is not None and not _fits(schema.data):
-            raise LogError(f"{self.log.path}: written by another version of the tick's layout")
-        self._topics[channel.id] = channel.topic
-
-    def _chunk(self, data: bytes) -> None:
-        array = np.frombuffer(data, np.uint8)
-        rows = np.empty((len(data) // 9 + 1, 3), np.int64)
-        rows = rows[: scan(array, rows)]
-        for opcode, start, length in rows[(rows[:, 0] == 3) | (rows[:, 0] == 4)].tolist():
-            self._definition(opcode, data[start : start + length])
-        messages = rows[rows[:, 0] == 5]
-        if len(messages) == 0:
+        name, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
+        if name is None:
             return
-        at = messages[:, 1]
-        channel = array[at].astype(np.int64) | array[at + 1].astype(np.int64) << 8
+        if schema is None or schema.name != name or channel.message_encoding != "protobuf":
+            raise LogError(
+                f"{self.log.path}: topic {channel.topic} has not the schema {name}; not a log of hil"
+            )
+        own = file_descriptor_set().SerializeToString()
+        if name != "hil.Stats" and message_layout(schema.data, name) != message_layout(own, name):
+            raise LogError(f"{self.log.path}: {name} has another layout; written by another version of hil")
+        self._topics[channel.id] = channel.topic
+        if channel.topic == "/tick":
+            self._tick_channel = channel.id
+
+    def _chunk(self, data: bytes) -> Iterator[Block]:
+        ticks = self._uniform(data)
+        if ticks is not None:
+            yield self._ticks(ticks)
+            return
+        rows = chunk_rows(data)
+        for opcode, start, length in rows[
+            (rows[:, 0] == Opcode.SCHEMA) | (rows[:, 0] == Opcode.CHANNEL)
+        ].tolist():
+            record = parse(opcode, data[start : start + length])
+            assert record is not None  # noqa: S101 - both kinds are parsed
+            self._define(record)
+        messages = rows[rows[:, 0] == MESSAGE]
+        if (messages[:, 2] < FIXED_BYTES).any():
+            raise DamagedError("a message is too short")
+        raw = np.frombuffer(data, np.uint8)
+        channel = raw[messages[:, 1]].astype(np.int64) | raw[messages[:, 1] + 1].astype(np.int64) << 8
         for number in np.unique(channel).tolist():
-            self._messages(self._topics.get(number, ""), data, array, messages[channel == number])
+            yield from self._messages(self._topics.get(number, ""), data, messages[channel == number])
 
-    def _definition(self, opcode: int, content: bytes) -> None:
-        """A schema or channel inside a chunk, as the writer puts them before their first message."""
-        raw = bytes((opcode,)) + struct.pack("<Q", len(content)) + content
-        from io import BytesIO
+    def _uniform(self, data: bytes) -> TickArray | None:
+        """The ticks of a chunk that holds nothing else, as this program writes it; None for any other."""
+        if not data or len(data) % TICK_MESSAGE.itemsize:
+            return None
+        messages = np.frombuffer(data, TICK_MESSAGE)
+        same = (messages["opcode"] == MESSAGE) & (messages["channel"] == self._tick_channel)
+        if not (same & (messages["length"] == FIXED_BYTES + TICK.itemsize)).all():
+            return None
+        return np.ascontiguousarray(messages["data"]).view(TICK)
 
-        for record in _one(StreamReader(BytesIO(raw), skip_magic=True)):
-            self.take(record)
-
-    def _messages(self, topic: str, data: bytes, array: npt.NDArray[np.uint8], rows: npt.NDArray[np.int64]) -> None:
+    def _messages(self, topic: str, data: bytes, rows: Rows) -> Iterator[Block]:
+        """The messages of one channel of a chunk."""
+        starts, lengths = rows[:, 1] + FIXED_BYTES, rows[:, 2] - FIXED_BYTES
         if topic == "/tick":
-            size = TICK.itemsize
-            if not (rows[:, 2] == size + 22).all():
-                raise LogError(f"{self.log.path}: tick records of another length than {size}")
-            index = (rows[:, 1] + 22)[:, None] + np.arange(size)[None, :]
-            self.blocks.append(array[index].view(TICK)[:, 0])
-        elif topic in ("/can/rx", "/can/tx") and self._frames:
-            received = topic == "/can/rx"
-            for start, length in rows[:, 1:].tolist():
-                self.log.frames.append(Frame(received, *unpack_can_frame(data[start + 22 : start + length])))
+            if (lengths != TICK.itemsize).any():
+                raise LogError(f"{self.log.path}: tick records of another length than {TICK.itemsize} bytes")
+            yield self._ticks(_gather(data, starts, TICK))
+        elif topic in ("/can/rx", "/can/tx"):
+            if (lengths < FRAME_HEAD).any():
+                raise DamagedError("a frame message is too short")
+            messages = _gather(data, starts, FRAME_MESSAGE)
+            try:
+                yield Block("frames", frames_from_messages(messages, lengths, topic == "/can/rx"))
+            except ValueError as error:
+                raise DamagedError(str(error)) from error
         elif topic == "/event":
-            for start, length in rows[:, 1:].tolist():
-                self.log.events.append(_event(data[start + 22 : start + length]))
+            for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
+                self._event(data[start : start + length])
+
+    def _event(self, raw: bytes) -> None:
+        try:
+            t_ns, k, kind, text = unpack_event(raw)
+        except ValueError as error:
+            raise DamagedError(str(error)) from error
+        self.log.events.append({"t_ns": t_ns, "k": k, "kind": kind, "text": text})
+
+    def _ticks(self, ticks: TickArray) -> Block:
+        """Count ticks; their tags must be those of the layout, or every value would be another's."""
+        own = new_ticks(1)
+        tags = [name for name in TICK.names or () if name.startswith("_")]
+        if any((ticks[name] != own[name]).any() for name in tags):
+            raise DamagedError("tick records whose tags do not fit")
+        self.log.tick_count += len(ticks)
+        self.log.last_t_ns = int(ticks["t_ns"][-1])
+        return Block("ticks", ticks)
 
 
-def _one(reader: StreamReader) -> Iterator[Any]:
-    """The first record of a stream that holds one."""
-    for record in reader.records:
-        yield record
-        return
+def _gather(data: bytes, starts: Rows, dtype: np.dtype[np.void]) -> Records:
+    """Records of ``dtype`` that begin at ``starts``; beyond the end of the data they read zeros."""
+    padded = np.frombuffer(data + bytes(dtype.itemsize), np.uint8)
+    index = starts[:, None] + np.arange(dtype.itemsize)[None, :]
+    return np.ascontiguousarray(padded[index]).view(dtype)[:, 0]
 
 
-def _fits(descriptors: bytes) -> bool:
-    """True when the file's descriptors are those of this version."""
-    return descriptors == file_descriptor_set().SerializeToString()
+def read_blocks(log: Log) -> Iterator[Block]:
+    """Go through ``log.path`` chunk by chunk; metadata, events and damage gather in ``log`` on the way.
+
+    Raises LogError for what is no log of hil at all, or one of another version.
+    """
+    one = _Pass(log)
+    try:
+        for raw in raw_records(log.path):
+            yield from one.take(raw)
+    except DamagedError as error:
+        one.problems.append(str(error))
+    except OSError as error:
+        if isinstance(error, LogError):
+            raise
+        raise LogError(f"{log.path}: can't be read: {error.strerror}") from error
+    if not one.ours and "run" not in log.metadata:
+        raise LogError(
+            f"{log.path}: is no log of hil ({'; '.join(one.problems) or 'it has no run metadata'})"
+        )
+    if one.problems:
+        log.damage = _damage(log, one)
 
 
-def _event(raw: bytes) -> dict[str, Any]:
-    """An event message as a dict."""
-    _, t_ns, _, k = struct.unpack_from("<BqBQ", raw)
-    texts, at = [], 18
-    while at < len(raw):
-        size, at = raw[at + 1], at + 2
-        if size & 0x80:
-            size, at = size & 0x7F | raw[at] << 7, at + 1
-        texts.append(raw[at : at + size].decode(errors="replace"))
-        at += size
-    return {"t_ns": t_ns, "k": k, "kind": texts[0] if texts else "", "text": texts[1] if len(texts) > 1 else ""}
+def _damage(log: Log, one: _Pass) -> str:
+    """One line: what is wrong, how much is good, what is missing."""
+    text = "; ".join(one.problems[:3]) + ("; and more" if len(one.problems) > 3 else "")
+    last = "" if log.last_t_ns is None else f", the last at t = {log.last_t_ns * 1e-9:.3f} s"
+    missing = "" if one.complete else "; the summary is missing"
+    ended = "" if "result" in log.metadata else "; the result is missing"
+    return f"damaged: {text}; {log.tick_count} ticks are good{last}{missing}{ended}"
 
 
-def records_of(path: Path) -> Iterator[Any]:
-    """Records of a file, chunks whole; raises what damages it."""
-    with path.open("rb") as stream:
-        yield from StreamReader(stream, emit_chunks=True, record_size_limit=MAX_RECORD).records
+class _Kept:
+    """Blocks held in memory, refused before they exhaust it."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._room = int(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * MEMORY_SHARE)
+        self.ticks: list[TickArray] = []
+        self.frames: list[Frame] = []
+
+    def add(self, block: Block) -> None:
+        """Keep a block. Raises LogError when the log does not fit."""
+        self._room -= block.records.nbytes * (1 if block.kind == "ticks" else 4)
+        if self._room < 0:
+            raise LogError(f"{self._path}: does not fit into memory; read it block by block (read_blocks)")
+        if block.kind == "ticks":
+            self.ticks.append(block.records)
+        else:
+            self.frames += [
+                Frame(bool(received), t_ns, can_id, bytes(data[:size]))
+                for t_ns, can_id, received, size, data in block.records.tolist()
+            ]
+
+    def joined(self) -> TickArray:
+        """All ticks; blocks are let go while they are copied, so that memory holds them once."""
+        out, at = np.empty(sum(map(len, self.ticks)), TICK), 0
+        self.ticks.reverse()
+        while self.ticks:
+            block = self.ticks.pop()
+            out[at : at + len(block)] = block
+            at += len(block)
+        return out
 
 
 def open_log(path: Path, *, frames: bool = True) -> Log:
-    """Read a log up to its damage. Raises LogError for what is no log of hil at all."""
+    """Read a log up to and around its damage. Raises LogError for what is no log of hil at all."""
     log = Log(path, new_ticks(0))
-    one = _Pass(log, frames)
     if not path.is_file():
         raise LogError(f"{path}: no such file")
-    try:
-        for record in records_of(path):
-            one.take(record)
-    except LogError:
-        raise
-    except _DAMAGE as error:
-        log.damage = str(error) or type(error).__name__
-    except OSError as error:
-        raise LogError(f"{path}: can't be read: {error.strerror}") from error
-    if "run" not in log.metadata:
-        raise LogError(f"{path}: is no log of hil ({log.damage or 'it has no run metadata'})")
-    if log.damage is None and not one.complete:
-        log.damage = "the file ends early"
-    if log.damage is not None:
-        log.damage = f"damaged after {sum(map(len, one.blocks))} ticks: {log.damage}"
-    if one.blocks:
-        log.ticks = np.concatenate(one.blocks)
+    kept = _Kept(path)
+    for block in read_blocks(log):
+        if block.kind == "ticks" or frames:
+            kept.add(block)
+    log.ticks, log.frames = kept.joined(), kept.frames
     return log

@@ -4,43 +4,47 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
+import select
 import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
-from hil.errors import HilError
+from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
+from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
-from hil.log.writer import EVENT, EVENT_BYTES, FRAME
 from hil.signals import TICK, TickArray
 
+__all__ = ["BYTES_PER_TICK", "LogError", "Recorder", "check_folder", "open_recorder"]
+
 RING_SECONDS: Final = 4
-WRITER_SILENT_NS: Final = 1_000_000_000
+FRAMES_PER_TICK: Final = 5
 BYTES_PER_TICK: Final = TICK.itemsize + 31 + 4 * 60
+LOOK_NS: Final = 100_000_000
+WRITER_SILENT_NS: Final = 2_000_000_000
 START_TIMEOUT_S: Final = 20.0
 CLOSE_TIMEOUT_S: Final = 60.0
-
-
-class LogError(HilError, OSError):
-    """A log that can't be written or read; the message says where and what to do."""
 
 
 def check_folder(path: Path, needed_bytes: int) -> None:
     """Refuse before arming: folder missing or not writable, file there already, disk too full."""
     folder = path.parent
+    if path.exists():
+        raise LogError(f"{path}: exists already; choose another [log] name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{path.name}.probe"
+        probe = folder / f".{path.name}.{os.getpid()}.probe"
         probe.touch(exist_ok=False)
         probe.unlink()
         free = shutil.disk_usage(folder).free
     except OSError as error:
-        raise LogError(f"{folder}: can't be written to ({error.strerror}); choose another [log] folder") from error
-    if path.exists():
-        raise LogError(f"{path}: exists already; choose another [log] name")
+        raise LogError(
+            f"{folder}: can't be written to ({error.strerror}); choose another [log] folder"
+        ) from error
     if free < needed_bytes:
         raise LogError(
             f"{folder}: {free / 1e6:.0f} MB free, this run needs about {needed_bytes / 1e6:.0f} MB; "
@@ -48,39 +52,67 @@ def check_folder(path: Path, needed_bytes: int) -> None:
         )
 
 
+def open_recorder(
+    path: Path, header: dict[str, Any], rate_hz: int, duration_s: float | None = None
+) -> Recorder:
+    """Check the folder for a run of that rate and length (one minute when open) and start the writer."""
+    check_folder(path, round((duration_s or 60.0) * rate_hz * BYTES_PER_TICK))
+    return Recorder(path, header, rate_hz)
+
+
+def first_line(stream: IO[bytes], timeout_s: float) -> str:
+    """The first line of a process's output; "" when it ended or said nothing in time."""
+    if not select.select([stream], [], [], timeout_s)[0]:
+        return ""
+    return stream.readline().decode(errors="replace").strip()
+
+
 class Recorder:
-    """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick."""
+    """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick.
+
+    ``header`` holds ``metadata`` (text to text) and ``attachments`` (name to text). Raises LogError when
+    the writer can't start.
+    """
 
     def __init__(self, path: Path, header: dict[str, Any], rate_hz: int) -> None:
         self.path = path
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
-        self._frames = Ring.create("frames", FRAME.size, rate_hz * RING_SECONDS * 5)
+        self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
-        self._header = self._ticks.header
-        self._beat, self._beat_ns = 0, time.monotonic_ns()
-        self._writer = self._start(path, header, rate_hz)
+        self._failed = self._closed = False
+        self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
+        self._writer = self._spawn()
+        try:
+            self._open(path, header)
+        except LogError:
+            self._end_writer(START_TIMEOUT_S)
+            self._release()
+            raise
 
-    def _start(self, path: Path, header: dict[str, Any], rate_hz: int) -> subprocess.Popen[bytes]:
-        fds = [self._ticks.fd, self._frames.fd, self._events.fd]
-        process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+    def _spawn(self) -> subprocess.Popen[bytes]:
+        fds = [ring.fd for ring in (self._ticks, self._frames, self._events)]
+        return subprocess.Popen(
             [sys.executable, "-m", "hil.log.writer", *map(str, fds)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=fds,
             start_new_session=True,
         )
-        chunk = max(4096, min(CHUNK_BYTES, rate_hz * BYTES_PER_TICK // 2))
-        opening = {"path": str(path), "header": header, "chunk_bytes": chunk}
-        assert process.stdin is not None and process.stdout is not None  # noqa: S101 - PIPE was asked for
-        with contextlib.suppress(BrokenPipeError):
-            process.stdin.write(json.dumps(opening).encode() + b"\n")
-            process.stdin.flush()
-        answer = process.stdout.readline().decode().strip()
+
+    def _open(self, path: Path, header: dict[str, Any]) -> None:
+        """Hand the writer its file and wait until it is open."""
+        self._say({"path": str(path), "header": header, "chunk_bytes": CHUNK_BYTES})
+        assert self._writer.stdout is not None  # noqa: S101 - PIPE was asked for
+        answer = first_line(self._writer.stdout, START_TIMEOUT_S)
         if answer != "ready":
-            process.stdin.close()
-            process.wait(START_TIMEOUT_S)
-            raise LogError(f"{path}: the writer can't start ({answer or 'it died'})")
-        return process
+            raise LogError(f"{path}: can't be written ({answer or 'the writer process died'})")
+
+    def _say(self, what: dict[str, Any]) -> None:
+        """One JSON line to the writer, if it lives."""
+        assert self._writer.stdin is not None  # noqa: S101 - PIPE was asked for
+        with contextlib.suppress(BrokenPipeError):
+            self._writer.stdin.write(json.dumps(what).encode() + b"\n")
+            self._writer.stdin.flush()
 
     @property
     def writer_pid(self) -> int:
@@ -89,54 +121,64 @@ class Recorder:
 
     @property
     def failed(self) -> bool:
-        """True when the writer reported an error or has not been heard of for a second."""
-        header = self._header
+        """True for good once the writer reported an error, died, or was silent for two seconds.
+
+        A writer that is merely slow is no failure: the rings hold twice as long.
+        """
+        if self._failed or self._closed:
+            return self._failed
+        header = self._ticks.header
+        beat, now_ns = header[BEAT_AT], time.monotonic_ns()
         if header[FAILED_AT]:
-            return True
-        beat = header[BEAT_AT]
-        if beat != self._beat:
-            self._beat, self._beat_ns = beat, time.monotonic_ns()
-            return False
-        return time.monotonic_ns() - self._beat_ns > WRITER_SILENT_NS
+            self._failed = True
+        elif beat != self._beat:
+            self._beat, self._beat_ns = beat, now_ns
+        elif now_ns - max(self._beat_ns, self._look_ns) > LOOK_NS:
+            self._look_ns = now_ns
+            self._failed = self._writer.poll() is not None or now_ns - self._beat_ns > WRITER_SILENT_NS
+        return self._failed
 
     def tick(self, tick: TickArray) -> None:
         """Store one tick."""
-        self._ticks.push(tick.view("u1").data)
+        self._ticks.push(tick.tobytes())
 
     def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one raw CAN frame."""
-        self._frames.push(FRAME.pack(t_ns, can_id, received, len(data), data))
+        self._frames.push(FRAME_RECORD.pack(t_ns, can_id, received, len(data), data))
 
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Store one event; the text is cut to what a record holds."""
-        kind_raw = kind.encode()[:64]
-        text_raw = text.encode()[: EVENT_BYTES - EVENT.size - len(kind_raw)]
-        record = EVENT.pack(t_ns, k, len(kind_raw), len(text_raw)) + kind_raw + text_raw
-        self._events.push(record.ljust(EVENT_BYTES, b"\0"))
+        self._events.push(pack_event_record(t_ns, k, kind, text))
 
     @property
     def dropped(self) -> int:
         """Ticks that the ring had no room for."""
-        return self._ticks.dropped
+        return self._dropped if self._closed else self._ticks.dropped
 
     def close(self, result: dict[str, Any]) -> bool:
         """Hand over the result, wait for the writer; True when the file is complete."""
-        pipe = self._writer.stdin
-        assert pipe is not None  # noqa: S101 - PIPE was asked for
+        if self._closed:
+            return not self._failed
+        self._say(result)
+        complete = self._end_writer(CLOSE_TIMEOUT_S) == 0
+        self._failed = self._failed or not complete
+        self._release()
+        return complete
+
+    def _end_writer(self, timeout_s: float) -> int:
+        """End the writer's input and wait for it; kill it when that takes too long."""
+        assert self._writer.stdin is not None and self._writer.stdout is not None  # noqa: S101 - PIPE
         with contextlib.suppress(BrokenPipeError):
-            pipe.write(json.dumps(result).encode() + b"\n")
-            pipe.flush()
-        with contextlib.suppress(BrokenPipeError):
-            pipe.close()
+            self._writer.stdin.close()
         try:
-            code = self._writer.wait(CLOSE_TIMEOUT_S)
+            code = self._writer.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._writer.kill()
             code = self._writer.wait()
-        if self._writer.stdout is not None:
-            self._writer.stdout.close()
+        self._writer.stdout.close()
+        return code
+
+    def _release(self) -> None:
+        self._dropped, self._closed = self._ticks.dropped, True
         for ring in (self._ticks, self._frames, self._events):
-            if ring is self._ticks:
-                self._header.release()
             ring.close()
-        return code == 0

@@ -1,14 +1,18 @@
 """A ring of fixed-size records in anonymous shared memory: one producer, one consumer, no lock.
 
 The producer never waits: a full ring drops the record and counts it. The memory is a memfd, so it has no
-name, nobody else can open it, and nothing is left behind after a SIGKILL. The consumer takes only records
-that were published before its previous look, so that it needs no memory fence to see them whole.
+name, only this user's processes can open it (through /proc), and nothing is left behind after a SIGKILL.
+The record is written before the head that publishes it, and the consumer takes only records that were
+published before its previous look, so that it needs no memory fence to see them whole. Any number of
+viewers may look at the newest records without either end noticing.
 """
 
 from __future__ import annotations
 
+import fcntl
 import mmap
 import os
+from pathlib import Path
 from typing import Final
 
 from hil.errors import HilError
@@ -24,32 +28,36 @@ class RingError(HilError, RuntimeError):
 
 
 class Ring:
-    """Both ends of a ring over a file descriptor."""
+    """One end of a ring over a file descriptor, which it owns. All pages are mapped before it returns."""
 
-    def __init__(self, fd: int) -> None:
+    def __init__(self, fd: int, *, view: bool = False) -> None:
         self.fd = fd
-        self._map = mmap.mmap(fd, 0)
+        size = os.fstat(fd).st_size
+        if size < HEADER_BYTES:
+            raise RingError("not a ring: too small")
+        access = mmap.PROT_READ if view else mmap.PROT_READ | mmap.PROT_WRITE
+        # populated, since the first touch of a page in the loop would cost a fault in the tick that does it
+        self._map = mmap.mmap(fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE, prot=access)
         self._bytes = memoryview(self._map)
         self.header = self._bytes[:HEADER_BYTES].cast("Q")
-        if self.header[MAGIC_AT] != MAGIC:
-            raise RingError("not a ring")
         self.record_size, self.capacity = self.header[SIZE_AT], self.header[CAPACITY_AT]
+        if self.header[MAGIC_AT] != MAGIC or HEADER_BYTES + self.record_size * self.capacity != size:
+            self.close()
+            raise RingError("not a ring: its header does not fit")
         self._seen = self.header[TAIL_AT]
 
     @classmethod
     def create(cls, name: str, record_size: int, capacity: int) -> Ring:
-        """Make a ring whose pages are all touched, so that no push ever faults."""
+        """Make a ring of ``capacity`` records of ``record_size`` bytes, all its memory really allocated."""
         size = HEADER_BYTES + record_size * capacity
-        if size > MAX_BYTES:
-            raise RingError(f"a ring of {size} bytes is too large")
-        fd = os.memfd_create(f"hil-{name}")
+        if record_size < 1 or capacity < 1 or size > MAX_BYTES:
+            raise RingError(f"a ring of {capacity} records of {record_size} bytes can't be made")
+        fd = os.memfd_create(f"hil-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.fchmod(fd, 0o600)
         os.posix_fallocate(fd, 0, size)
-        with mmap.mmap(fd, size) as pages:
-            pages[HEADER_BYTES:] = bytes(size - HEADER_BYTES)
-            header = memoryview(pages)[:HEADER_BYTES].cast("Q")
-            header[MAGIC_AT], header[SIZE_AT], header[CAPACITY_AT] = MAGIC, record_size, capacity
-            header.release()
+        fcntl.fcntl(fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
+        header = b"".join(value.to_bytes(8, "little") for value in (MAGIC, record_size, capacity))
+        os.pwrite(fd, header, 0)
         return cls(fd)
 
     def push(self, record: bytes | memoryview) -> bool:
@@ -72,14 +80,27 @@ class Ring:
         header[HIGH_AT] = max(header[HIGH_AT], head - tail)
         if end <= tail:
             return b""
-        first, last = tail % self.capacity, end % self.capacity
-        size, base = self.record_size, HEADER_BYTES
-        if first < last:
-            out = bytes(self._bytes[base + first * size : base + last * size])
-        else:
-            wrap = self._bytes[base : base + last * size]
-            out = bytes(self._bytes[base + first * size : base + self.capacity * size]) + bytes(wrap)
+        out = self._copy(tail, end)
         header[TAIL_AT] = end
+        return out
+
+    def latest(self, count: int) -> bytes:
+        """Return up to ``count`` newest records without taking them; for viewers, at any time."""
+        head = self.header[HEAD_AT]
+        start = max(0, head - min(count, self.capacity - 1))
+        out = self._copy(start, head)
+        # what the producer overwrote while this copied is cut off; it may be at work on one more
+        oldest_whole = self.header[HEAD_AT] + 1 - self.capacity
+        return out[max(0, oldest_whole - start) * self.record_size :]
+
+    def _copy(self, start: int, end: int) -> bytes:
+        """The bytes of records ``start`` to ``end`` (counted from the ring's beginning)."""
+        size, base = self.record_size, HEADER_BYTES
+        first, count = start % self.capacity, end - start
+        whole = min(count, self.capacity - first)
+        out = bytes(self._bytes[base + first * size : base + (first + whole) * size])
+        if whole < count:
+            out += bytes(self._bytes[base : base + (count - whole) * size])
         return out
 
     @property
@@ -87,9 +108,26 @@ class Ring:
         """Records dropped since the ring was made."""
         return int(self.header[DROPPED_AT])
 
+    @property
+    def high_water(self) -> int:
+        """Most records that ever waited, as the consumer saw it."""
+        return int(self.header[HIGH_AT])
+
     def close(self) -> None:
         """Unmap and close."""
         self.header.release()
         self._bytes.release()
         self._map.close()
         os.close(self.fd)
+
+
+def attach(pid: int, name: str) -> Ring:
+    """Open another process's ring for viewing. Raises RingError when it has none of that name."""
+    wanted = f"/memfd:hil-{name} (deleted)"
+    try:
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            if str(link.readlink()) == wanted:
+                return Ring(os.open(link, os.O_RDONLY | os.O_CLOEXEC), view=True)
+    except OSError as error:
+        raise RingError(f"process {pid}: can't be looked into ({error.strerror})") from error
+    raise RingError(f"process {pid} has no ring {name!r}")

@@ -1,7 +1,8 @@
-"""Protobuf schemas of the logged topics, built from the field tables and embedded in every file.
+"""What the logged bytes mean: protobuf schemas, built from the field tables and embedded in every file.
 
-A TICK record's bytes are a valid ``hil.Tick`` message. Units and meanings of the fields go to the file's
-metadata, since a descriptor carries no comments.
+A TICK record's bytes are a valid ``hil.Tick`` message. The other messages are laid out here as packed
+dtypes in the same way: each value is preceded by its protobuf tag, so that many are made or read at once.
+Units and meanings of the fields go to the file's metadata, since a descriptor carries no comments.
 """
 
 from __future__ import annotations
@@ -9,12 +10,37 @@ from __future__ import annotations
 import struct
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto, FileDescriptorSet
+from google.protobuf.message import DecodeError
 
 from hil.signals import FIELDS
 
-TOPICS: Final = {"/tick": "hil.Tick", "/can/rx": "hil.CanFrame", "/can/tx": "hil.CanFrame", "/event": "hil.Event",
-                 "/stats": "hil.Stats"}
+Records = npt.NDArray[np.void]
+Bytes = npt.NDArray[np.uint8]
+
+TOPICS: Final = {
+    "/tick": "hil.Tick",
+    "/can/rx": "hil.CanFrame",
+    "/can/tx": "hil.CanFrame",
+    "/event": "hil.Event",
+    "/stats": "hil.Stats",
+}
+FRAME: Final = np.dtype(
+    [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
+)
+"""A CAN frame as the ring and the reader hold it; ``can_id`` carries SocketCAN's flag bits."""
+FRAME_MESSAGE: Final = np.dtype(
+    [
+        ("_1", "u1"), ("t_ns", "<i8"), ("_2", "u1"), ("can_id", "<u4"),
+        ("_3", "u1"), ("size", "u1"), ("data", "u1", (64,)),
+    ]
+)  # fmt: skip
+"""A ``hil.CanFrame`` with room for 64 bytes; of a shorter frame the message is the first 16 + size bytes."""
+FRAME_HEAD: Final = FRAME_MESSAGE.itemsize - 64
+FRAME_TAGS: Final = (("_1", 0x09), ("_2", 0x15), ("_3", 0x1A))
+
 _TYPES: Final = {
     "f8": FieldDescriptorProto.TYPE_DOUBLE,
     "u8": FieldDescriptorProto.TYPE_FIXED64,
@@ -24,10 +50,14 @@ _TYPES: Final = {
     "bytes": FieldDescriptorProto.TYPE_BYTES,
     "string": FieldDescriptorProto.TYPE_STRING,
 }
+_STATS: Final = (
+    "ticks", "dropped", "high_water", "frames", "dropped_frames", "dropped_events",
+    "lateness_p50_ns", "lateness_p99_ns", "lateness_max_ns", "file_bytes",
+)  # fmt: skip
 _OTHERS: Final = {
     "CanFrame": (("t_ns", "i8"), ("can_id", "u4"), ("data", "bytes")),
     "Event": (("t_ns", "i8"), ("k", "u8"), ("kind", "string"), ("text", "string")),
-    "Stats": (("t_ns", "i8"), ("ticks", "u8"), ("dropped", "u8"), ("high_water", "u8"), ("frames", "u8")),
+    "Stats": (("t_ns", "i8"), *((name, "i8") for name in _STATS)),
 }
 
 
@@ -44,6 +74,19 @@ def file_descriptor_set() -> FileDescriptorSet:
     return FileDescriptorSet(file=[file])
 
 
+def message_layout(descriptors: bytes, name: str) -> list[tuple[int, str, int]] | None:
+    """(number, name, type) of each field of message ``hil.NAME``; None when there is none."""
+    try:
+        files = FileDescriptorSet.FromString(descriptors).file
+    except DecodeError:
+        return None
+    for file in files:
+        for message in file.message_type:
+            if f"{file.package}.{message.name}" == name:
+                return [(field.number, field.name, int(field.type)) for field in message.field]
+    return None
+
+
 def units() -> dict[str, str]:
     """Unit of each field of a tick, for the file's metadata."""
     return {field.name: field.unit for field in FIELDS}
@@ -54,31 +97,76 @@ def meanings() -> dict[str, str]:
     return {field.name: field.doc for field in FIELDS}
 
 
-def _length_delimited(number: int, data: bytes) -> bytes:
-    """A bytes or string field of fewer than 16384 bytes."""
-    size = len(data)
-    varint = bytes((size,)) if size < 128 else bytes((size & 0x7F | 0x80, size >> 7))
-    return bytes((number << 3 | 2,)) + varint + data
+def _varint(value: int) -> bytes:
+    out = bytearray()
+    while value > 0x7F:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes((*out, value))
 
 
-def pack_can_frame(t_ns: int, can_id: int, data: bytes) -> bytes:
-    """A ``hil.CanFrame``; can_id with SocketCAN's flag bits."""
-    return struct.pack("<BqBI", 0x09, t_ns, 0x15, can_id) + _length_delimited(3, data)
-
-
-def unpack_can_frame(raw: bytes) -> tuple[int, int, bytes]:
-    """Inverse of :func:`pack_can_frame`: (t_ns, can_id, data)."""
-    _, t_ns, _, can_id = struct.unpack_from("<BqBI", raw)
-    size = raw[15]
-    return t_ns, can_id, raw[16 : 16 + size]
+def _text(number: int, text: str) -> bytes:
+    """A string field."""
+    data = text.encode(errors="replace")
+    return _varint(number << 3 | 2) + _varint(len(data)) + data
 
 
 def pack_event(t_ns: int, k: int, kind: str, text: str) -> bytes:
     """A ``hil.Event``."""
-    head = struct.pack("<BqBQ", 0x09, t_ns, 0x11, k)
-    return head + _length_delimited(3, kind.encode()) + _length_delimited(4, text.encode()[:8000])
+    return struct.pack("<BqBQ", 0x09, t_ns, 0x11, k) + _text(3, kind) + _text(4, text)
 
 
-def pack_stats(t_ns: int, ticks: int, dropped: int, high_water: int, frames: int) -> bytes:
-    """A ``hil.Stats``."""
-    return struct.pack("<BqBQBQBQBQ", 0x09, t_ns, 0x11, ticks, 0x19, dropped, 0x21, high_water, 0x29, frames)
+def _take_text(raw: bytes, at: int) -> tuple[str, int]:
+    """The string field at ``at``, and where it ends. Raises ValueError or IndexError."""
+    at += 1
+    size = shift = 0
+    while raw[at] & 0x80 and shift < 28:
+        size, at, shift = size | (raw[at] & 0x7F) << shift, at + 1, shift + 7
+    size, at = size | raw[at] << shift, at + 1
+    if at + size > len(raw):
+        raise ValueError("a text runs over the end of its message")
+    return raw[at : at + size].decode(errors="replace"), at + size
+
+
+def unpack_event(raw: bytes) -> tuple[int, int, str, str]:
+    """Inverse of :func:`pack_event`: (t_ns, k, kind, text). Raises ValueError for other bytes."""
+    try:
+        _, t_ns, _, k = struct.unpack_from("<BqBQ", raw)
+        kind, at = _take_text(raw, 18)
+        return t_ns, k, kind, _take_text(raw, at)[0]
+    except (struct.error, IndexError) as error:
+        raise ValueError("not an event message") from error
+
+
+def pack_stats(t_ns: int, values: dict[str, int]) -> bytes:
+    """A ``hil.Stats``; a value that is not given is left out, which protobuf reads as 0."""
+    out = struct.pack("<Bq", 0x09, t_ns)
+    for number, name in enumerate(_STATS, start=2):
+        if name in values:
+            out += _varint(number << 3 | 1) + struct.pack("<q", values[name])
+    return out
+
+
+def frame_messages(frames: Records) -> Records:
+    """FRAME records as FRAME_MESSAGE records, tags in place; bytes after a frame's size mean nothing."""
+    out = np.empty(len(frames), FRAME_MESSAGE)
+    for name, tag in FRAME_TAGS:
+        out[name] = tag
+    for name in ("t_ns", "can_id", "size", "data"):
+        out[name] = frames[name]
+    return out
+
+
+def frames_from_messages(messages: Records, lengths: npt.NDArray[np.int64], received: bool) -> Records:
+    """Inverse of :func:`frame_messages`. Raises ValueError when bytes are no message of ours."""
+    if any((messages[name] != tag).any() for name, tag in FRAME_TAGS) or (messages["size"] > 64).any():
+        raise ValueError("not a frame message")
+    if (lengths != messages["size"].astype(np.int64) + FRAME_HEAD).any():
+        raise ValueError("a frame message of another length than it says")
+    out = np.zeros(len(messages), FRAME)
+    for name in ("t_ns", "can_id", "size"):
+        out[name] = messages[name]
+    out["received"] = received
+    inside = np.arange(64)[None, :] < messages["size"][:, None]
+    out["data"] = np.where(inside, messages["data"], 0)
+    return out

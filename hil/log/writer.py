@@ -11,55 +11,85 @@ import json
 import os
 import select
 import signal
-import struct
 import sys
+import time
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from hil.log.mcapfile import RunFile
-from hil.log.ring import BEAT_AT, FAILED_AT, HIGH_AT, Ring
-from hil.log.schema import pack_can_frame
+from hil.log.records import EVENT, EVENT_BYTES
+from hil.log.ring import BEAT_AT, FAILED_AT, Ring
+from hil.log.schema import FRAME
 from hil.signals import TICK
 
 DRAIN_S: Final = 0.02
-STATS_EVERY: Final = 50
-FRAME = struct.Struct("<qIBB64s")
-EVENT = struct.Struct("<qQHH")
-EVENT_BYTES: Final = 512
+CHUNK_S: Final = 0.5
+STATS_S: Final = 1.0
 NICE: Final = 10
+Rings = tuple[Ring, Ring, Ring]
+
+
+class Every:
+    """True once a period; the first time after one period."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._next_s = time.monotonic() + period_s
+
+    def due(self) -> bool:
+        """Whether the period has passed since it last was true."""
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return False
+        self._next_s = now_s + self._period_s
+        return True
 
 
 class Drain:
     """Rings in, file out."""
 
-    def __init__(self, rings: tuple[Ring, Ring, Ring], file: RunFile) -> None:
+    def __init__(self, rings: Rings, file: RunFile) -> None:
         self._ticks, self._frames, self._events = rings
         self._file = file
-        self._sequence = 0
         self._t_ns = 0
+        self._lateness: list[np.ndarray[Any, np.dtype[np.int32]]] = []
 
     def once(self, *, final: bool = False) -> None:
-        """Move everything that is published."""
-        raw = self._ticks.take(final=final)
-        if raw:
-            ticks = np.frombuffer(raw, TICK)
+        """Move everything that is published into the file's chunks."""
+        ticks = np.frombuffer(self._ticks.take(final=final), TICK)
+        if len(ticks):
             self._file.add_ticks(ticks)
             self._t_ns = int(ticks["t_ns"][-1])
-        for t_ns, can_id, received, size, data in FRAME.iter_unpack(self._frames.take(final=final)):
-            self._file.add_frame(bool(received), t_ns, pack_can_frame(t_ns, can_id, data[:size]), self._sequence)
-            self._sequence += 1
+            self._lateness.append(ticks["lateness_ns"])
+        self._file.add_frames(np.frombuffer(self._frames.take(final=final), FRAME))
         raw = self._events.take(final=final)
         for at in range(0, len(raw), EVENT_BYTES):
-            t_ns, k, kind_size, text_size = EVENT.unpack_from(raw, at)
-            text = raw[at + EVENT.size : at + EVENT.size + kind_size + text_size]
-            self._file.add_event(t_ns, k, text[:kind_size].decode(), text[kind_size:].decode(errors="replace"))
-        self._file.flush()
+            self._event(raw[at : at + EVENT_BYTES])
+
+    def _event(self, raw: bytes) -> None:
+        t_ns, k, kind_size, text_size = EVENT.unpack_from(raw)
+        kind = raw[EVENT.size : EVENT.size + kind_size].decode(errors="replace")
+        text = raw[EVENT.size + kind_size : EVENT.size + kind_size + text_size].decode(errors="replace")
+        self._file.add_event(t_ns, k, kind, text)
 
     def stats(self) -> None:
-        """Write drops and the ring's high-water mark."""
-        self._file.add_stats(self._t_ns, self._ticks.dropped, self._ticks.header[HIGH_AT])
+        """Write what was dropped, how full the ring was and how late the ticks since the last time were."""
+        values = {
+            "ticks": self._file.ticks,
+            "dropped": self._ticks.dropped,
+            "high_water": self._ticks.high_water,
+            "frames": self._file.frames,
+            "dropped_frames": self._frames.dropped,
+            "dropped_events": self._events.dropped,
+            "file_bytes": self._file.size,
+        }
+        if self._lateness:
+            p50, p99, top = np.percentile(np.concatenate(self._lateness), (50, 99, 100))
+            values |= {"lateness_p50_ns": int(p50), "lateness_p99_ns": int(p99), "lateness_max_ns": int(top)}
+            self._lateness = []
+        self._file.add_stats(self._t_ns, values)
 
     def losses(self) -> dict[str, int]:
         """Records dropped per ring."""
@@ -70,29 +100,48 @@ class Drain:
         }
 
 
-def read_available() -> bytes | None:
-    """What came on standard input within a drain period; b"" for nothing, None for its end."""
-    if not select.select([0], [], [], DRAIN_S)[0]:
+def read_available(wait_s: float) -> bytes | None:
+    """What came on standard input within ``wait_s``; b"" for nothing, None for its end."""
+    if not select.select([0], [], [], wait_s)[0]:
         return b""
     return os.read(0, 1 << 16) or None
 
 
-def serve(rings: tuple[Ring, Ring, Ring], file: RunFile) -> dict[str, Any]:
+def read_opening() -> tuple[dict[str, Any], bytes] | None:
+    """The first line of standard input and what follows it; None when the controller went away before."""
+    raw = b""
+    while b"\n" not in raw:
+        more = os.read(0, 1 << 16)
+        if not more:
+            return None
+        raw += more
+    line, rest = raw.split(b"\n", 1)
+    opening: dict[str, Any] = json.loads(line)
+    return opening, rest
+
+
+def serve(rings: Rings, file: RunFile, control: bytes) -> dict[str, Any]:
     """Drain until standard input ends; return the result that the controller sent, if any."""
-    drain, control, header = Drain(rings, file), b"", rings[0].header
-    turn = 0
-    while (more := read_available()) is not None:
+    drain, header = Drain(rings, file), rings[0].header
+    chunk, stats = Every(CHUNK_S), Every(STATS_S)
+    while (more := read_available(DRAIN_S)) is not None:
         control += more
         drain.once()
-        header[BEAT_AT] += 1
-        turn += 1
-        if turn % STATS_EVERY == 0:
+        if stats.due():
             drain.stats()
+        if chunk.due():
+            file.flush()
+        header[BEAT_AT] += 1
     drain.once(final=True)
     drain.stats()
-    lines = [line for line in control.split(b"\n") if line]
+    return result_of(control) | drain.losses()
+
+
+def result_of(control: bytes) -> dict[str, Any]:
+    """The last whole line that the controller sent; it died when there is none."""
+    lines = control.split(b"\n")[:-1]
     result: dict[str, Any] = json.loads(lines[-1]) if lines else {"ended": "controller died"}
-    return result | drain.losses()
+    return result
 
 
 def main() -> int:
@@ -101,19 +150,26 @@ def main() -> int:
         signal.signal(number, signal.SIG_IGN)  # the file must be finished; the end of input ends us
     os.nice(NICE)
     rings = (Ring(int(sys.argv[1])), Ring(int(sys.argv[2])), Ring(int(sys.argv[3])))
-    header = rings[0].header
-    opening = json.loads(sys.stdin.buffer.raw.readline())  # type: ignore[attr-defined]
-    file = None
+    came = read_opening()
+    if came is None:
+        return 1
+    return write_run(rings, *came)
+
+
+def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
+    """Write the file that ``opening`` names; 0 when it is complete."""
+    header, file = rings[0].header, None
     try:
         file = RunFile(Path(opening["path"]), opening["header"], opening["chunk_bytes"])
         header[BEAT_AT] += 1
-        print("ready", flush=True)  # noqa: T201 - the recorder waits for this line
-        file.finish(serve(rings, file))
+        os.write(1, b"ready\n")
+        file.finish(serve(rings, file, control))
     except OSError as error:
         header[FAILED_AT] = 1
-        print(f"failed {error}", flush=True)  # noqa: T201 - the recorder shows it
-        if file is not None:
-            file.abandon()
+        if file is None:
+            os.write(1, f"{error.strerror}\n".encode())  # the recorder waits for a line
+        else:
+            file.abandon(f"log failed: {error.strerror}")
         return 1
     return 0
 

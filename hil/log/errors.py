@@ -1,0 +1,13 @@
+"""What goes wrong with a log, for both ends of it."""
+
+from __future__ import annotations
+
+from hil.errors import HilError
+
+
+class LogError(HilError, OSError):
+    """A log that can't be written or read; the message says where and what to do."""
+
+
+class DamagedError(ValueError):
+    """Bytes that are no valid MCAP; what precedes them is good. The reader turns it into ``Log.damage``."""

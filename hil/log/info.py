@@ -1,0 +1,144 @@
+"""What is in a log, from its summary and metadata alone: milliseconds, whatever its length."""
+
+from __future__ import annotations
+
+import io
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO, Any, Final
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import AttachmentIndex, Channel, Footer, McapRecord, Metadata, MetadataIndex, Statistics
+
+from hil.log.container import MAGIC
+from hil.log.errors import DamagedError, LogError
+from hil.log.reader import Log, read_blocks
+from hil.log.scan import MAX_RECORD, parse, read_record
+from hil.signals import new_ticks
+
+_FOOTER_BYTES: Final = 9 + 20
+_HEAD_BYTES: Final = 9
+_SUMMARY: Final[dict[int, Any]] = {
+    Opcode.CHANNEL: Channel,
+    Opcode.STATISTICS: Statistics,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+}
+
+
+@dataclass(slots=True)
+class Info:
+    """A log at a glance. ``counts`` is messages a topic; ``damage`` is None for a complete file."""
+
+    path: Path
+    size: int
+    counts: dict[str, int] = field(default_factory=dict)
+    start_ns: int | None = None
+    end_ns: int | None = None
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, int] = field(default_factory=dict)
+    damage: str | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "log": str(self.path),
+            "bytes": self.size,
+            "counts": self.counts,
+            "start_ns": self.start_ns,
+            "end_ns": self.end_ns,
+            "run": self.metadata.get("run", {}),
+            "result": self.metadata.get("result", {}),
+            "attachments": self.attachments,
+            "damage": self.damage,
+        }
+
+
+def info(path: Path) -> Info:
+    """Read the summary; a log without one is read whole. Raises LogError for what is no log of hil."""
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
+    try:
+        with path.open("rb") as stream:
+            return _from_summary(path, stream)
+    except (DamagedError, McapError, ValueError, EOFError):
+        return _from_blocks(path)
+    except OSError as error:
+        if isinstance(error, LogError):
+            raise
+        raise LogError(f"{path}: can't be read: {error.strerror}") from error
+
+
+def _from_summary(path: Path, stream: IO[bytes]) -> Info:
+    size = os.fstat(stream.fileno()).st_size
+    at = size - _FOOTER_BYTES - len(MAGIC)
+    footer = _record_at(stream, at, size)
+    if not isinstance(footer, Footer) or stream.read(len(MAGIC)) != MAGIC:
+        raise DamagedError("there is no footer")
+    if not 0 < footer.summary_start < at or at - footer.summary_start > MAX_RECORD:
+        raise DamagedError("there is no summary")
+    out, topics, counts = Info(path, size), {}, {}
+    for record in _summary(stream, footer.summary_start, at):
+        if isinstance(record, Channel):
+            topics[record.id] = record.topic
+        elif isinstance(record, Statistics):
+            counts = record.channel_message_counts
+            out.start_ns, out.end_ns = record.message_start_time, record.message_end_time
+        elif isinstance(record, AttachmentIndex):
+            out.attachments[record.name] = record.data_size
+        elif isinstance(record, MetadataIndex):
+            found = _record_at(stream, record.offset, size)
+            if isinstance(found, Metadata):
+                out.metadata[found.name] = dict(found.metadata)
+    out.counts = {topic: counts.get(number, 0) for number, topic in topics.items()}
+    if "run" not in out.metadata:
+        raise LogError(f"{path}: is no log of hil (it has no run metadata)")
+    return out
+
+
+def _record_at(stream: IO[bytes], at: int, size: int) -> McapRecord | None:
+    if not 0 < at < size:
+        raise DamagedError("an index points out of the file")
+    stream.seek(at)
+    raw = read_record(stream, at, size)
+    return parse(raw.opcode, raw.content)
+
+
+def _summary(stream: IO[bytes], start: int, end: int) -> list[Any]:
+    """Records of the summary section that say what is in the file."""
+    out, at = [], start
+    stream.seek(start)
+    while at < end:
+        raw = read_record(stream, at, end)
+        at += _HEAD_BYTES + len(raw.content)
+        parser = _SUMMARY.get(raw.opcode)
+        if parser is not None:
+            out.append(parser.read(ReadDataStream(io.BytesIO(raw.content))))
+    return out
+
+
+def _from_blocks(path: Path) -> Info:
+    """Count by reading everything, for a log without summary."""
+    log, counts, start_ns = Log(path, new_ticks(0)), {"/tick": 0, "/can/rx": 0, "/can/tx": 0}, None
+    for kind, records in read_blocks(log):
+        if kind == "ticks":
+            counts["/tick"] += len(records)
+            start_ns = int(records["t_ns"][0]) if start_ns is None else start_ns
+        else:
+            received = int((records["received"] != 0).sum())
+            counts["/can/rx"] += received
+            counts["/can/tx"] += len(records) - received
+    counts["/event"] = len(log.events)
+    return Info(
+        path=path,
+        size=path.stat().st_size,
+        counts=counts,
+        start_ns=start_ns,
+        end_ns=log.last_t_ns,
+        metadata=log.metadata,
+        attachments={name: len(text) for name, text in log.attachments.items()},
+        damage=log.damage,
+    )
