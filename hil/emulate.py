@@ -9,6 +9,7 @@ from drivers.bus import Link, open_link
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
+from hil import realtime
 from hil.app import Overrides, bus_settings
 from hil.config import RunConfig, load_toml
 from hil.errors import ConfigError
@@ -22,9 +23,8 @@ def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None)
     return load_toml(plant_path, PlantConfig, settings or []), plant_path.parent
 
 
-def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tuple[Node, Link, str]:
+def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple[Node, Link, str]:
     """Load everything, open the bus; return the node and a line that says what it is."""
-    config = load_toml(path, RunConfig, overrides.as_settings())
     plant, folder = load_plant(path, config, plant_settings)
     database = Database(folder / plant.dbc, plant.node_id)
     params = build_params(plant, wire_of(database))
@@ -45,8 +45,12 @@ def make_node(path: Path, overrides: Overrides, plant_settings: list[str]) -> tu
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     """Run the emulator until SIGINT or SIGTERM. Prints one line when it listens and one at the end."""
-    node, link, what = make_node(path, overrides, plant_settings)
+    config = load_toml(path, RunConfig, overrides.as_settings())
+    node, link, what = make_node(path, config, plant_settings)
     node.warm_up()
+    if config.loop.clock == "realtime":
+        below = config.realtime.model_copy(update={"fifo_priority": max(0, config.realtime.fifo_priority - 1)})
+        realtime.acquire(below.model_copy(update={"cpu": None}))
     stopped = False
 
     def stop(*_: object) -> None:
