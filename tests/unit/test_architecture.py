@@ -1,0 +1,76 @@
+"""The import rule of the house, read from the source."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import ROOT
+
+PACKAGES = ("hil", "drivers", "firmware_model")
+STDLIB_OK = {"__future__", "collections", "dataclasses", "math", "typing", "enum"}
+COMPOSITION = {"hil/app.py", "hil/cli.py", "hil/emulate.py", "hil/simulate.py", "hil/demo.py", "hil/check.py"}
+
+
+def imports(path: Path) -> set[str]:
+    """Every module that a file imports, however deep in it."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+    return found
+
+
+def files(package: str) -> list[Path]:
+    return sorted((ROOT / package).rglob("*.py"))
+
+
+def starts(modules: set[str], *heads: str) -> set[str]:
+    return {m for m in modules if any(m == h or m.startswith(h + ".") for h in heads)}
+
+
+def test_there_is_something_to_check() -> None:
+    assert all(len(files(package)) > 5 for package in PACKAGES)
+
+
+@pytest.mark.parametrize("path", files("hil/control"), ids=lambda p: p.name)
+def test_control_is_pure(path: Path) -> None:
+    foreign = {
+        m for m in imports(path) - starts(imports(path), "hil.control", "numpy", "scipy", "numba")
+        if m.split(".")[0] not in STDLIB_OK
+    }
+    assert not foreign
+
+
+@pytest.mark.parametrize("path", files("drivers"), ids=lambda p: p.name)
+def test_drivers_know_neither_side(path: Path) -> None:
+    assert not starts(imports(path), "hil", "firmware_model")
+
+
+@pytest.mark.parametrize("path", files("firmware_model"), ids=lambda p: p.name)
+def test_the_emulator_shares_nothing_with_the_controller(path: Path) -> None:
+    assert not starts(imports(path), "hil", "drivers.client")
+
+
+@pytest.mark.parametrize("path", files("hil"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_only_the_composition_root_knows_drivers_and_the_emulator(path: Path) -> None:
+    if str(path.relative_to(ROOT)) not in COMPOSITION:
+        assert not starts(imports(path), "drivers", "firmware_model")
+
+
+@pytest.mark.parametrize("name", ["loop", "supervisor", "guard", "kernel"])
+def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
+    own = starts(imports(ROOT / "hil" / f"{name}.py"), "hil")
+    assert own <= starts(own, "hil.ports", "hil.signals", "hil.control", "hil.guard", "hil.supervisor")
+
+
+def test_nothing_reads_a_clock_but_the_places_that_may() -> None:
+    may = {"clock.py", "app.py", "simulate.py", "ring.py", "recorder.py", "writer.py"}
+    for path in files("hil"):
+        if path.name in may or "paper" in path.parts or path.name in ("bench.py", "play.py", "check.py"):
+            continue
+        assert "time" not in imports(path), path

@@ -1,0 +1,148 @@
+"""The ring against a plain queue, under any order of pushes and takes, wrapped or full."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+from collections import deque
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hil.log.ring import HEADER_BYTES, Ring, RingError, attach
+
+SIZE = 16
+
+
+def record(number: int) -> bytes:
+    return number.to_bytes(SIZE // 2, "little") * 2
+
+
+def numbers(raw: bytes) -> list[int]:
+    """The records' numbers; a torn record fails here."""
+    out = [int.from_bytes(raw[at : at + SIZE // 2], "little") for at in range(0, len(raw), SIZE)]
+    assert raw == b"".join(map(record, out)), "a torn record"
+    return out
+
+
+@given(
+    capacity=st.integers(1, 7),
+    steps=st.lists(st.one_of(st.integers(1, 9), st.sampled_from(["take", "final"])), max_size=40),
+)
+def test_the_ring_is_a_queue_that_drops_when_full(capacity: int, steps: list[int | str]) -> None:
+    ring = Ring.create("test", SIZE, capacity)
+    queue: deque[int] = deque()
+    dropped, pushed, seen = 0, 0, 0
+    for step in steps:
+        if isinstance(step, int):
+            for _ in range(step):
+                kept = ring.push(record(pushed))
+                assert kept == (len(queue) < capacity)
+                if kept:
+                    queue.append(pushed)
+                dropped += not kept
+                pushed += 1
+            continue
+        ready = len(queue) if step == "final" else seen
+        assert numbers(ring.take(final=step == "final")) == [queue.popleft() for _ in range(ready)]
+        seen = len(queue)
+        assert ring.high_water >= seen
+    assert ring.dropped == dropped
+    ring.close()
+
+
+@given(capacity=st.integers(2, 9), pushed=st.integers(0, 30), wanted=st.integers(0, 12))
+def test_a_viewer_sees_the_newest_and_takes_nothing(capacity: int, pushed: int, wanted: int) -> None:
+    ring = Ring.create("test", SIZE, capacity)
+    for number in range(pushed):
+        ring.push(record(number))
+        if ring.header[3] - ring.header[4] == capacity:
+            ring.take(final=True)
+    waiting = ring.header[3] - ring.header[4]
+    seen = numbers(ring.latest(wanted))
+    assert seen == list(range(pushed))[max(0, pushed - min(wanted, capacity - 1)) :]
+    assert ring.header[3] - ring.header[4] == waiting
+    ring.close()
+
+
+def test_a_record_is_taken_only_at_the_look_after_the_one_that_saw_it() -> None:
+    ring = Ring.create("test", SIZE, 4)
+    ring.push(record(1))
+    assert ring.take() == b""
+    ring.push(record(2))
+    assert numbers(ring.take()) == [1]
+    assert numbers(ring.take()) == [2]
+    ring.close()
+
+
+def test_the_memory_has_no_name_and_is_the_users_alone() -> None:
+    ring = Ring.create("test", SIZE, 4)
+    assert stat.S_IMODE(os.fstat(ring.fd).st_mode) == 0o600
+    assert not os.get_inheritable(ring.fd)
+    with pytest.raises(PermissionError):
+        os.ftruncate(ring.fd, 0)
+    ring.close()
+
+
+@pytest.mark.parametrize(("size", "capacity"), [(0, 4), (16, 0), (1 << 20, 1 << 20)])
+def test_an_impossible_ring_is_refused(size: int, capacity: int) -> None:
+    with pytest.raises(RingError):
+        Ring.create("test", size, capacity)
+
+
+@pytest.mark.parametrize("content", [b"", bytes(100), bytes(HEADER_BYTES + 64)])
+def test_foreign_memory_is_no_ring(content: bytes) -> None:
+    fd = os.memfd_create("foreign")
+    os.write(fd, content)
+    with pytest.raises(RingError):
+        Ring(fd)
+
+
+def test_a_wrong_record_size_is_refused() -> None:
+    ring = Ring.create("test", SIZE, 4)
+    with pytest.raises(ValueError):
+        ring.push(bytes(SIZE + 1))
+    assert ring.take(final=True) == b""
+    ring.close()
+
+
+PRODUCER = """
+import sys
+from hil.log.ring import Ring
+ring = Ring(int(sys.argv[1]))
+number = 0
+while number < int(sys.argv[2]):
+    number += ring.push(number.to_bytes(8, "little") * 2)
+"""
+
+
+def test_two_processes_lose_and_tear_nothing() -> None:
+    """The producer tries again after a drop, so that the consumer must see every number once, in order."""
+    ring, total = Ring.create("test", SIZE, 64), 30_000
+    producer = subprocess.Popen(
+        [sys.executable, "-c", PRODUCER, str(ring.fd), str(total)], pass_fds=[ring.fd]
+    )
+    expected = 0
+    while expected < total:
+        for number in numbers(ring.take()):
+            assert number == expected
+            expected += 1
+        assert producer.poll() in (None, 0)
+    assert producer.wait(30) == 0 and ring.take(final=True) == b""
+    ring.close()
+
+
+def test_another_process_can_attach_by_pid() -> None:
+    ring = Ring.create("test-attach", SIZE, 8)
+    ring.push(record(5))
+    view = attach(os.getpid(), "test-attach")
+    assert numbers(view.latest(3)) == [5]
+    with pytest.raises(TypeError):
+        view.push(record(6))
+    view.close()
+    with pytest.raises(RingError, match="no ring"):
+        attach(os.getpid(), "none")
+    ring.close()
