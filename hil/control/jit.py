@@ -6,13 +6,33 @@ architecture and with the compiler switched off (``NUMBA_DISABLE_JIT=1``).
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 
 numba.config.CPU_NAME = "generic"
 numba.config.CPU_FEATURES = ""
+
+
+def cache_folder(root: Path) -> Path:
+    """Folder of compiled kernels for exactly this source.
+
+    numba looks at the file of a function, not at those of the functions that it calls; a digest of all
+    sources keeps it from running an old callee inside a new caller.
+    """
+    digest = hashlib.sha256()
+    for package in ("hil", "drivers", "firmware_model"):
+        for path in sorted((root / package).rglob("*.py")):
+            digest.update(path.read_bytes())
+    base = Path(os.environ.get("NUMBA_CACHE_DIR") or root / ".cache" / "numba")
+    return base / digest.hexdigest()[:16]
+
+
+numba.config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[2]))
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

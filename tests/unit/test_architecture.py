@@ -10,7 +10,7 @@ import pytest
 from tests.conftest import ROOT
 
 PACKAGES = ("hil", "drivers", "firmware_model")
-STDLIB_OK = {"__future__", "collections", "dataclasses", "math", "typing", "enum"}
+STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclasses", "math", "typing", "enum"}
 COMPOSITION = {"hil/app.py", "hil/cli.py", "hil/emulate.py", "hil/simulate.py", "hil/demo.py", "hil/check.py"}
 
 

@@ -6,6 +6,7 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from collections import deque
 
 import pytest
@@ -131,6 +132,7 @@ def test_two_processes_lose_and_tear_nothing() -> None:
             assert number == expected
             expected += 1
         assert producer.poll() in (None, 0)
+        time.sleep(0.0005)
     assert producer.wait(30) == 0 and ring.take(final=True) == b""
     ring.close()
 

@@ -1,0 +1,75 @@
+"""Our files in other people's readers: the mcap package with mcap-protobuf-support."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+from hil.signals import FIELDS
+from tests.logfiles import HEADER, some_frames, some_ticks, write_log
+
+TICKS, FRAMES = some_ticks(300), some_frames(900)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_log(tmp_path / "run.mcap", TICKS, FRAMES)
+    return tmp_path / "run.mcap"
+
+
+def test_ticks_have_named_fields_with_the_logged_values(path: Path) -> None:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        seen = list(reader.iter_decoded_messages(topics=["/tick"]))
+    assert len(seen) == len(TICKS)
+    for logged, (schema, _, message, tick) in zip(TICKS, seen, strict=True):
+        assert schema is not None and schema.name == "hil.Tick"
+        assert message.log_time == message.publish_time == logged["t_ns"] and message.sequence == logged["k"]
+        assert all(getattr(tick, field.name) == logged[field.name] for field in FIELDS)
+
+
+def test_units_stand_in_the_metadata(path: Path) -> None:
+    with path.open("rb") as stream:
+        metadata = {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
+    assert metadata["units"]["T_L_hat"] == "N m" and metadata["run"]["clock"] == "lockstep"
+
+
+def test_frames_events_and_statistics_decode(path: Path) -> None:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        by_topic: dict[str, list[object]] = {}
+        for _, channel, _, message in reader.iter_decoded_messages():
+            by_topic.setdefault(channel.topic, []).append(message)
+    frames = [(m.can_id, m.data) for topic in ("/can/rx", "/can/tx") for m in by_topic[topic]]  # type: ignore[attr-defined]
+    assert sorted(frames) == sorted((int(f["can_id"]), bytes(f["data"][: f["size"]])) for f in FRAMES)
+    assert len(by_topic["/event"]) == len(by_topic["/stats"]) == 6
+
+
+def test_a_time_window_is_found_by_the_index(path: Path) -> None:
+    with path.open("rb") as stream:
+        window = make_reader(stream).iter_messages(
+            ["/tick"], starting_at=100_000_000, ending_before=110_000_000
+        )
+        assert [message.sequence for _, _, message in window] == list(range(100, 110))
+
+
+def test_every_checksum_holds_and_the_summary_counts(path: Path) -> None:
+    with path.open("rb") as stream:
+        assert sum(1 for _ in StreamReader(stream, validate_crcs=True).records) > len(TICKS)
+    with path.open("rb") as stream:
+        summary = make_reader(stream, validate_crcs=True).get_summary()
+    assert summary is not None and summary.statistics is not None
+    statistics = summary.statistics
+    assert statistics.message_count == len(TICKS) + len(FRAMES) + 12
+    assert statistics.chunk_count == len(summary.chunk_indexes) == 12
+    assert (statistics.message_start_time, statistics.message_end_time) == (0, 299_000_000)
+
+
+def test_attachments_come_back(path: Path) -> None:
+    with path.open("rb") as stream:
+        found = {record.name: record.data.decode() for record in make_reader(stream).iter_attachments()}
+    assert found == HEADER["attachments"]

@@ -1,0 +1,150 @@
+"""The guard alone: what it lets through, changes and trips on, without any control law."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hil.guard import SAFETY_PARAMS, guard_command, is_denormal, limit_step, to_wire, voltage_limit
+from hil.kernel import new_safety_state
+from hil.signals import DriveState, GuardFlag, Reason, RxFlag, new_ticks
+
+ANY = st.floats(allow_nan=True, allow_infinity=True)
+VALUES: dict[str, float] = {
+    "T_s": 1e-3, "w_max": 150.0, "i_trip": 22.0, "u_max": 300.0, "du_max": 50.0, "T_L_max": 10.0,
+    "v_dc_min": 0.0, "v_dc_max": 1e4, "temperature_max": 110.0, "i_continuous": 8.0, "i2t_max": math.inf,
+    "power_window": 1.0, "energy_max": math.inf, "deviation_max": math.inf, "soft_start_ticks": 0,
+    "trip_ticks": 3, "guard_trip_ticks": 5, "hold_ticks": 3, "quick_stop_ticks": 20, "error_budget": 8,
+    "enable_ticks": 100, "max_gap": 20, "counter_modulus": 16, "u_lsb": 0.01, "T_L_lsb": 0.01, "J": 0.011,
+}  # fmt: skip
+
+
+class Guard:
+    """The guard with its records; operation enabled unless said otherwise."""
+
+    def __init__(self, **changed: float) -> None:
+        self.p, self.s, self.ticks = np.zeros(1, SAFETY_PARAMS), new_safety_state(), new_ticks()
+        for name, value in {**VALUES, **changed}.items():
+            self.p[name] = value
+        self.t: Any = self.ticks[0]
+        self.t["state"] = int(DriveState.OPERATION_ENABLED)
+        self.s["state"] = int(DriveState.OPERATION_ENABLED)
+        self.s["run_ticks"] = 10_000
+        self.t["rx_flags"] = int(RxFlag.FRESH)
+
+    def ask(self, u_q: float, u_d: float = 0.0, T_L: float = 0.0) -> tuple[float, float, float, int, int]:
+        reason = guard_command(self.p[0], self.s[0], self.t, u_q, u_d, T_L)
+        t = self.t
+        return float(t["u_q"]), float(t["u_d"]), float(t["T_L"]), int(t["guard_flags"]), int(reason)
+
+
+def test_what_is_within_limits_passes_rounded_to_the_wire() -> None:
+    assert Guard().ask(12.344, -3.127, 1.236) == (12.34, -3.13, 1.24, 0, 0)
+
+
+def test_no_negative_zero_leaves() -> None:
+    u_q, u_d, T_L, _, _ = Guard().ask(-0.001, -0.0, -0.004)
+    assert [math.copysign(1.0, v) for v in (u_q, u_d, T_L)] == [1.0, 1.0, 1.0]
+
+
+def test_the_circle_keeps_the_direction() -> None:
+    u_q, u_d, _, flags, _ = Guard(du_max=1e9).ask(600.0, 800.0)
+    assert (u_q, u_d) == (180.0, 240.0) and flags == GuardFlag.VOLTAGE
+
+
+def test_the_step_limit_counts_from_the_last_command() -> None:
+    guard = Guard()
+    assert [guard.ask(120.0)[0] for _ in range(4)] == [50.0, 100.0, 120.0, 120.0]
+    assert guard.ask(-120.0)[0] == 70.0
+
+
+def test_load_torque_is_limited() -> None:
+    assert Guard().ask(0.0, 0.0, -11.0)[2:4] == (-10.0, GuardFlag.LOAD_TORQUE)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("where", range(3))
+def test_what_is_no_number_becomes_zero_and_stops(bad: float, where: int) -> None:
+    asked = [1.0, 1.0, 1.0]
+    asked[where] = bad
+    u_q, u_d, T_L, flags, reason = Guard().ask(*asked)
+    assert (u_q, u_d, T_L) == (0.0, 0.0, 0.0)
+    assert flags & GuardFlag.NOT_A_NUMBER and reason == Reason.CONTROLLER_ERROR
+
+
+def test_denormals_become_zero() -> None:
+    u_q, _, _, flags, reason = Guard().ask(5e-324, 2.0)
+    assert u_q == 0.0 and flags & GuardFlag.DENORMAL and reason == Reason.NONE
+    assert not is_denormal(0.0) and not is_denormal(2.3e-308) and is_denormal(-2.2e-308)
+
+
+@pytest.mark.parametrize("state", [s for s in DriveState if s != DriveState.OPERATION_ENABLED])
+def test_states_in_which_only_zero_may_be_sent(state: DriveState) -> None:
+    guard = Guard()
+    guard.t["state"] = int(state)
+    assert guard.ask(10.0, 10.0, 10.0) == (0.0, 0.0, 0.0, int(GuardFlag.STATE_FORCES_ZERO), 0)
+
+
+def test_a_persistent_excess_trips_and_a_passing_one_does_not() -> None:
+    guard = Guard(du_max=1e9)
+    assert [guard.ask(301.0)[4] for _ in range(5)] == [0, 0, 0, 0, Reason.GUARD_PERSISTENT]
+    guard = Guard(du_max=1e9)
+    for _ in range(20):
+        assert all(guard.ask(301.0)[4] == 0 for _ in range(4))
+        assert guard.ask(299.0)[4] == 0
+
+
+def test_soft_start_grows_and_never_trips() -> None:
+    guard = Guard(soft_start_ticks=100, du_max=1e9)
+    sent = []
+    for k in range(120):
+        guard.s["run_ticks"] = k
+        u_q, _, _, flags, reason = guard.ask(250.0)
+        assert reason == Reason.NONE
+        sent.append(u_q)
+    assert sent[0] == 0.0 and sent[50] == 150.0 and sent[100] == 250.0
+    assert all(b >= a for a, b in zip(sent, sent[1:], strict=False))
+    guard.s["run_ticks"] = 100
+    assert voltage_limit(guard.p[0], guard.s[0]) == 300.0
+
+
+def test_an_applied_voltage_that_deviates_trips_when_it_persists() -> None:
+    guard = Guard(deviation_max=5.0)
+    guard.s["ua_q"] = 20.0
+    guard.ask(14.0)
+    assert guard.t["guard_flags"] & GuardFlag.APPLIED_DEVIATES
+    reasons = []
+    for _ in range(6):
+        guard.s["ua_q"] = 20.0
+        reasons.append(guard.ask(14.0)[4])
+    assert Reason.GUARD_PERSISTENT in reasons
+    guard.s["ua_q"], guard.s["ua_d"] = 17.0, 4.0  # 5 V away: allowed
+    guard.ask(14.0)
+    assert not guard.t["guard_flags"] & GuardFlag.APPLIED_DEVIATES
+
+
+@given(u_q=ANY, u_d=ANY, T_L=ANY, before_q=st.floats(-300, 300), state=st.sampled_from(list(DriveState)))
+@settings(max_examples=300, deadline=None)
+def test_whatever_is_asked_what_leaves_is_safe(
+    u_q: float, u_d: float, T_L: float, before_q: float, state: DriveState
+) -> None:
+    guard = Guard()
+    guard.t["state"] = int(state)
+    guard.s["u_q"] = before_q
+    got_q, got_d, got_T, _, _ = guard.ask(u_q, u_d, T_L)
+    assert all(map(math.isfinite, (got_q, got_d, got_T)))
+    if state != DriveState.OPERATION_ENABLED or not all(map(math.isfinite, (u_q, u_d, T_L))):
+        assert (got_q, got_d, got_T) == (0.0, 0.0, 0.0)
+        return
+    assert abs(got_q - before_q) <= 50.0 + 0.01 and abs(got_d) <= 50.0 + 0.01 and abs(got_T) <= 10.0
+    assert abs(got_q) <= 300.0 + 0.01
+
+
+def test_to_wire_is_what_a_codec_does() -> None:
+    assert to_wire(0.125, 0.25) == 0.0 and to_wire(0.375, 0.25) == 0.5  # halves to even
+    assert limit_step(5.0, 0.0, 2.0) == 2.0 and limit_step(-5.0, 0.0, 2.0) == -2.0
