@@ -16,7 +16,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
 from hil.log.container import FIXED_BYTES, LIBRARY
 from hil.log.errors import DamagedError, LogError
@@ -98,9 +98,11 @@ class _Pass:
         self.log = log
         self._schemas: dict[int, Schema] = {}
         self._topics: dict[int, str] = {}
+        self._named: dict[int, str] = {}
         self._tick_channel = -1
         self.ours = self.complete = False
         self.problems: list[str] = []
+        self._messages_seen = 0
 
     def take(self, raw: Raw) -> Iterator[Block]:
         """What a record of the file brings; one that is damaged is named and left out."""
@@ -127,11 +129,22 @@ class _Pass:
             self._channel(record)
         elif isinstance(record, Metadata):
             self.log.metadata[record.name] = dict(record.metadata)
+        elif isinstance(record, Statistics):
+            self._compare(record.message_count)
         elif isinstance(record, Footer):
             self.complete = True
 
+    def _compare(self, count: int) -> None:
+        """The summary's count: the last word on whether a record was overlooked."""
+        if self._tick_channel < 0:
+            self.problems.append("it has no channel for ticks")
+        if count != self._messages_seen and not self.problems:
+            self.problems.append(f"its summary counts {count} messages, {self._messages_seen} are there")
+
     def _channel(self, channel: Channel) -> None:
         """Learn a channel; a topic of ours with another schema is another program's or version's."""
+        if self._named.setdefault(channel.id, channel.topic) != channel.topic:
+            self.problems.append(f"channel {channel.id} has two topics")
         name, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
         if name is None:
             return
@@ -149,6 +162,7 @@ class _Pass:
     def _chunk(self, data: bytes) -> Iterator[Block]:
         ticks = self._uniform(data)
         if ticks is not None:
+            self._messages_seen += len(ticks)
             yield self._ticks(ticks)
             return
         rows = chunk_rows(data)
@@ -159,6 +173,7 @@ class _Pass:
             assert record is not None  # noqa: S101 - both kinds are parsed
             self._define(record)
         messages = rows[rows[:, 0] == MESSAGE]
+        self._messages_seen += len(messages)
         if (messages[:, 2] < FIXED_BYTES).any():
             raise DamagedError("a message is too short")
         raw = np.frombuffer(data, np.uint8)

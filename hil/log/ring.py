@@ -9,6 +9,7 @@ viewers may look at the newest records without either end noticing.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import mmap
 import os
@@ -126,8 +127,9 @@ def attach(pid: int, name: str) -> Ring:
     wanted = f"/memfd:hil-{name} (deleted)"
     try:
         for link in Path(f"/proc/{pid}/fd").iterdir():
-            if str(link.readlink()) == wanted:
-                return Ring(os.open(link, os.O_RDONLY | os.O_CLOEXEC), view=True)
+            with contextlib.suppress(FileNotFoundError):  # closed meanwhile
+                if str(link.readlink()) == wanted:
+                    return Ring(os.open(link, os.O_RDONLY | os.O_CLOEXEC), view=True)
     except OSError as error:
         raise RingError(f"process {pid}: can't be looked into ({error.strerror})") from error
     raise RingError(f"process {pid} has no ring {name!r}")

@@ -21,7 +21,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
 from hil.log.container import MAGIC
 from hil.log.errors import DamagedError
@@ -35,6 +35,7 @@ _PARSERS: Final[dict[int, Any]] = {
     Opcode.CHANNEL: Channel,
     Opcode.CHUNK: Chunk,
     Opcode.METADATA: Metadata,
+    Opcode.STATISTICS: Statistics,
     Opcode.FOOTER: Footer,
 }
 _MALFORMED: Final = (McapError, EOFError, ValueError, struct.error, zstandard.ZstdError)

@@ -1,4 +1,4 @@
-"""Recorder and writer process: kills at random moments, a full disk, a slow writer, refusals before arming."""
+"""Recorder and writer process: kills at random moments, a full disk, a slow writer, early refusals."""
 
 from __future__ import annotations
 
@@ -252,8 +252,8 @@ def test_a_viewer_follows_a_run_without_the_writer_noticing(tmp_path: Path) -> N
 
 
 def test_no_descriptor_is_left_open(tmp_path: Path) -> None:
-    before = len(os.listdir("/proc/self/fd"))
+    before = len(list(Path("/proc/self/fd").iterdir()))
     for number in range(3):
         with recording(tmp_path / f"{number}.mcap") as recorder:
             recorder.tick(new_ticks())
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
