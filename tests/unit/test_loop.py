@@ -1,0 +1,198 @@
+"""The loop over a scripted drive and a fake clock: deadlines, skips, and a stop on every way out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from hil.clock import FakeClock, LockstepClock, RealClock
+from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
+
+MS = 1_000_000
+
+
+class ScriptedDrive:
+    """A drive port that writes down what is asked of it."""
+
+    def __init__(self, fail_at: dict[str, int] | None = None, error: type[Exception] = OSError) -> None:
+        self.calls: list[str] = []
+        self.fail_at, self.error = fail_at or {}, error
+
+    def _note(self, name: str) -> None:
+        self.calls.append(name)
+        if self.calls.count(name) == self.fail_at.get(name):
+            raise self.error(f"{name} failed")
+
+    def sync(self, tick: Any) -> None:
+        self._note("sync")
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        self._note("receive")
+        tick["rx_flags"] |= int(RxFlag.FRESH)
+
+    def send(self, tick: Any) -> None:
+        self._note("send")
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+
+    def close(self) -> None:
+        self.calls.append("close")
+
+
+class Memory:
+    """A recorder that keeps copies."""
+
+    failed = False
+
+    def __init__(self) -> None:
+        self.ticks: list[TickArray] = []
+        self.events: list[str] = []
+
+    def tick(self, tick: TickArray) -> None:
+        self.ticks.append(tick.copy())
+
+    def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
+        raise AssertionError("the loop logs no frames itself")
+
+    def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
+        self.events.append(kind)
+
+
+def nothing(ticks: TickArray) -> None:
+    """Prepare nothing."""
+
+
+def obedient(ticks: TickArray) -> None:
+    """A supervisor that sends until it is asked to stop."""
+    t = ticks[0]
+    stop = t["request"] in (Request.STOP, Request.QUICK_STOP) or t["rx_flags"] & RxFlag.BUS_DOWN
+    t["send"] = 0 if stop else 1
+    t["state"] = int(DriveState.SWITCH_ON_DISABLED if stop else DriveState.OPERATION_ENABLED)
+    t["reason"] = int(Reason.STOP_REQUESTED) if stop else 0
+
+
+def make(
+    drive: ScriptedDrive, clock: FakeClock, ticks: int | None = 10, step: Any = obedient, pacing: Any = "sync"
+) -> tuple[Loop, Memory, StopRequest]:
+    memory, request = Memory(), StopRequest()
+    plan = Plan(MS, MS * 6 // 10, pacing, ticks)
+    return Loop(drive, clock, memory, nothing, step, new_ticks(), plan, request), memory, request
+
+
+def test_read_judge_compute_write_record_in_order() -> None:
+    drive = ScriptedDrive()
+    loop, memory, _ = make(drive, FakeClock(), ticks=2)
+    outcome = loop.run()
+    assert drive.calls == ["sync", "receive", "send"] * 2 + ["sync", "receive", "stop"]
+    assert [int(t["k"][0]) for t in memory.ticks] == [0, 1, 2]
+    assert (outcome.ticks, outcome.skipped, outcome.reason) == (2, 0, Reason.STOP_REQUESTED)
+
+
+def test_deadlines_are_absolute() -> None:
+    deadlines: list[int] = []
+    loop, memory, _ = make(ScriptedDrive(), FakeClock([300_000] * 20, deadlines.append), ticks=5)
+    loop.run()
+    assert deadlines == [k * MS for k in range(6)]
+    assert {int(t["lateness_ns"][0]) for t in memory.ticks} == {300_000}
+
+
+def test_whole_periods_are_skipped_and_counted_never_caught_up() -> None:
+    late = [0, 0, 3 * MS + 200_000, 0, 0, 0]
+    loop, memory, _ = make(ScriptedDrive(), FakeClock(late), ticks=8)
+    outcome = loop.run()
+    assert [(int(t["k"][0]), int(t["gap"][0]), int(t["skipped"][0])) for t in memory.ticks][:4] == [
+        (0, 1, 0), (1, 1, 0), (5, 4, 3), (6, 1, 0),
+    ]  # fmt: skip
+    assert outcome.skipped == 3
+    assert int(memory.ticks[2]["lateness_ns"][0]) == 200_000
+    assert int(memory.ticks[2]["t_ns"][0]) == 5 * MS
+
+
+def test_a_little_late_is_run_and_not_skipped() -> None:
+    loop, memory, _ = make(ScriptedDrive(), FakeClock([0, 999_999, 0]), ticks=3)
+    assert loop.run().skipped == 0
+    assert int(memory.ticks[1]["gap"][0]) == 1
+
+
+@pytest.mark.parametrize("where", ["receive"])
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_every_exception_ends_with_a_stopped_drive(where: str, error: type[Exception]) -> None:
+    drive = ScriptedDrive({where: 3}, error)
+    loop, _, _ = make(drive, FakeClock())
+    with pytest.raises(error):
+        loop.run()
+    assert drive.calls[-1] == "stop"
+
+
+def test_an_exception_in_the_law_ends_with_a_stopped_drive() -> None:
+    def broken(ticks: TickArray) -> None:
+        raise ZeroDivisionError
+
+    drive = ScriptedDrive()
+    loop, _, _ = make(drive, FakeClock(), step=broken)
+    with pytest.raises(ZeroDivisionError):
+        loop.run()
+    assert drive.calls[-1] == "stop" and "send" not in drive.calls
+
+
+def test_a_sync_that_fails_is_a_bus_that_is_down() -> None:
+    drive = ScriptedDrive({"sync": 2})
+    loop, memory, _ = make(drive, FakeClock())
+    loop.run()
+    assert memory.ticks[1]["rx_flags"][0] & RxFlag.BUS_DOWN
+    assert drive.calls[-1] == "stop"
+
+
+def test_a_command_that_fails_is_logged_and_marked() -> None:
+    loop, memory, _ = make(ScriptedDrive({"send": 2}), FakeClock(), ticks=4)
+    loop.run()
+    assert memory.events == ["send-failed"]
+    assert [int(t["send"][0]) for t in memory.ticks][:4] == [1, 0, 1, 1]
+
+
+def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:
+    drive = ScriptedDrive()
+    make(drive, FakeClock(), ticks=2, pacing="timer")[0].run()
+    assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"]
+
+
+def test_feedback_pacing_is_woken_by_the_drive() -> None:
+    drive, slept = ScriptedDrive(), []
+    make(drive, FakeClock(on_sleep=slept.append), ticks=2, pacing="feedback")[0].run()
+    assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"] and slept == []
+
+
+def test_stop_asked_twice_is_a_quick_stop() -> None:
+    request = StopRequest()
+    request.stop(2, None)
+    assert request.value == Request.STOP
+    request.stop()
+    assert request.value == Request.QUICK_STOP
+    request.stop()
+    assert request.value == Request.QUICK_STOP
+
+
+def test_a_run_without_length_goes_on_until_it_is_stopped() -> None:
+    drive = ScriptedDrive()
+    loop, memory, request = make(drive, FakeClock(on_sleep=lambda d: request.stop() if d == 50 * MS else None), None)
+    assert loop.run().ticks == 50
+
+
+def test_outcome_starts_empty() -> None:
+    assert Outcome() == Outcome(0, 0, 0, 0)
+
+
+def test_clocks() -> None:
+    real, lockstep = RealClock(), LockstepClock()
+    now = real.now_ns()
+    assert real.sleep_until(now + 2 * MS) >= now + 2 * MS
+    assert real.sleep_until(now) >= now + 2 * MS
+    assert real.receive_deadline(5, 7) == 12
+    assert (lockstep.sleep_until(9 * MS), lockstep.now_ns()) == (9 * MS, 9 * MS)
+    assert lockstep.receive_deadline(0, 1) > real.now_ns() + 1_000 * MS
+    fake = FakeClock([5])
+    fake.advance(3)
+    assert (fake.now_ns(), fake.sleep_until(10), fake.receive_deadline(1, 2)) == (3, 15, 3)
