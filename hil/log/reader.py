@@ -38,6 +38,9 @@ __all__ = ["Frame", "Log", "LogError", "open_log", "read_blocks"]
 
 Rows = npt.NDArray[np.int64]
 MEMORY_SHARE: Final = 0.5
+SLAB_TICKS: Final = 1 << 17  # 48 MB, above the size up to which malloc keeps freed memory
+_WHOLE: Final = np.dtype(f"V{TICK.itemsize}")  # copied at once, where TICK is copied field by field
+FRAME_OBJECT_RATIO: Final = 4  # a Frame object over its 78-byte record
 
 
 class Frame(NamedTuple):
@@ -268,36 +271,55 @@ def _damage(log: Log, one: _Pass) -> str:
 
 
 class _Kept:
-    """Blocks held in memory, refused before they exhaust it."""
+    """Blocks held in memory, refused before they exhaust it.
+
+    Ticks are gathered in slabs so large that the allocator gives each back to the system when it is let go;
+    so memory holds the ticks about once, also while they are joined.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._room = int(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * MEMORY_SHARE)
-        self.ticks: list[TickArray] = []
+        self._slabs: list[TickArray] = []
+        self._filled = SLAB_TICKS
         self.frames: list[Frame] = []
 
     def add(self, block: Block) -> None:
         """Keep a block. Raises LogError when the log does not fit."""
-        self._room -= block.records.nbytes * (1 if block.kind == "ticks" else 4)
+        self._room -= block.records.nbytes * (1 if block.kind == "ticks" else FRAME_OBJECT_RATIO)
         if self._room < 0:
             raise LogError(f"{self._path}: does not fit into memory; read it block by block (read_blocks)")
         if block.kind == "ticks":
-            self.ticks.append(block.records)
+            self._add_ticks(block.records)
         else:
             self.frames += [
                 Frame(bool(received), t_ns, can_id, bytes(data[:size]))
                 for t_ns, can_id, received, size, data in block.records.tolist()
             ]
 
+    def _add_ticks(self, ticks: TickArray) -> None:
+        ticks = ticks.view(_WHOLE)
+        while len(ticks):
+            if self._filled == SLAB_TICKS:
+                self._slabs.append(np.empty(SLAB_TICKS, _WHOLE))
+                self._filled = 0
+            part = ticks[: SLAB_TICKS - self._filled]
+            self._slabs[-1][self._filled : self._filled + len(part)] = part
+            self._filled += len(part)
+            ticks = ticks[len(part) :]
+
     def joined(self) -> TickArray:
-        """All ticks; blocks are let go while they are copied, so that memory holds them once."""
-        out, at = np.empty(sum(map(len, self.ticks)), TICK), 0
-        self.ticks.reverse()
-        while self.ticks:
-            block = self.ticks.pop()
-            out[at : at + len(block)] = block
-            at += len(block)
-        return out
+        """All ticks; a slab is let go as soon as it is copied."""
+        if not self._slabs:
+            return new_ticks(0)
+        self._slabs[-1] = self._slabs[-1][: self._filled]
+        out, at = np.empty(sum(map(len, self._slabs)), _WHOLE), 0
+        self._slabs.reverse()
+        while self._slabs:
+            slab = self._slabs.pop()
+            out[at : at + len(slab)] = slab
+            at += len(slab)
+        return out.view(TICK)
 
 
 def open_log(path: Path, *, frames: bool = True) -> Log:
