@@ -1,1 +1,1 @@
-"""CAN: bus, codec and drive client. The only package that knows CAN; imports neither hil nor firmware_model."""
+"""CAN: bus, codec and drive client. The only package that knows CAN; knows neither side of the bus."""

@@ -56,8 +56,12 @@ class DriveClient:
         self._sync_id = database.message("SYNC").can_id
         self._sync_counter = 0
         self._command = database.message("COMMAND", "Counter", "Controlword", "VoltageQ", "VoltageD")
-        self._feedback = database.message("FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State")
-        self._load = database.message("LOAD_COMMAND") if load and "LoadTorque" not in self._command.signals else None
+        self._feedback = database.message(
+            "FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State"
+        )
+        self._load = (
+            database.message("LOAD_COMMAND") if load and "LoadTorque" not in self._command.signals else None
+        )
         self._with_load = load and self._load is None
         self._counter_modulus = self._feedback.counter_modulus
         self._last_counter = -1
@@ -181,7 +185,11 @@ class DriveClient:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         self._last_sent = int(tick["counter"])
         self._send_command(
-            self._last_sent, int(tick["controlword"]), float(tick["u_q"]), float(tick["u_d"]), float(tick["T_L"])
+            self._last_sent,
+            int(tick["controlword"]),
+            float(tick["u_q"]),
+            float(tick["u_d"]),
+            float(tick["T_L"]),
         )
 
     def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
@@ -232,7 +240,11 @@ class DriveClient:
         end = time.monotonic_ns() + round(timeout_s * 1e9)
         while (left := end - time.monotonic_ns()) > 0:
             frame = self._link.receive(left)
-            if frame is not None and not frame.flags and frame.can_id in (self.heartbeat_id, self.feedback_id):
+            if (
+                frame is not None
+                and not frame.flags
+                and frame.can_id in (self.heartbeat_id, self.feedback_id)
+            ):
                 return True
         return False
 

@@ -69,8 +69,10 @@ class Signal:
         raw = round(value)
         low, high = self.raw_range()
         if not (low <= raw <= high):
-            raise EncodeError(f"{self.name}: {phys} {self.unit} does not fit {low * self.scale + self.offset} .. "
-                              f"{high * self.scale + self.offset}")
+            raise EncodeError(
+                f"{self.name}: {phys} {self.unit} does not fit {low * self.scale + self.offset} .. "
+                f"{high * self.scale + self.offset}"
+            )
         return raw & ((1 << self.length) - 1)
 
 
@@ -114,7 +116,7 @@ class Message:
     def protect(self, data: bytearray) -> None:
         """Fill in the CRC of the message's E2E profile."""
         if self.profile == 2:
-            data[0] = crc_profile_2(data, self._ids)
+            data[0] = crc_profile_2(bytes(data), self._ids)
         elif self.profile == 5:
             data[0:2] = crc_profile_5(bytes(data), int.from_bytes(self._ids, "big")).to_bytes(2, "little")
 
@@ -166,8 +168,17 @@ def _signal(parsed: Any, length: int, where: str, message: Any) -> Signal:
     minimum = low * scale + offset if parsed.minimum is None else float(parsed.minimum)
     maximum = high * scale + offset if parsed.maximum is None else float(parsed.maximum)
     return Signal(
-        parsed.name, shift, parsed.length, big, bool(parsed.is_signed), bool(parsed.is_float),
-        scale, offset, minimum, maximum, parsed.unit or "",
+        parsed.name,
+        shift,
+        parsed.length,
+        big,
+        bool(parsed.is_signed),
+        bool(parsed.is_float),
+        scale,
+        offset,
+        minimum,
+        maximum,
+        parsed.unit or "",
     )
 
 
@@ -199,8 +210,8 @@ class Database:
         self.path = path
         self.text = _read(path)
         try:
-            parsed = cantools.database.load_string(self.text, database_format="dbc", strict=True)
-        except Exception as error:  # noqa: BLE001 - cantools and its parser raise many unrelated types
+            parsed: Any = cantools.database.load_string(self.text, database_format="dbc", strict=True)
+        except Exception as error:
             raise DatabaseError(f"{path}: is no usable DBC: {_first_line(error)}") from error
         self.messages = {
             m.name: Message(m, _shifted(m.frame_id, node_id), str(path)) for m in parsed.messages
@@ -210,7 +221,9 @@ class Database:
         """The message ``name``, which must have ``signals``. Raises DatabaseError."""
         found = self.messages.get(name)
         if found is None:
-            raise DatabaseError(f"{self.path}: has no message {name}; it has {', '.join(sorted(self.messages))}")
+            raise DatabaseError(
+                f"{self.path}: has no message {name}; it has {', '.join(sorted(self.messages))}"
+            )
         for signal in signals:
             if signal not in found.signals:
                 raise DatabaseError(

@@ -114,7 +114,9 @@ class LocalBus(can.BusABC):
         can_id |= ERR_FLAG if msg.is_error_frame else 0
         if msg.is_fd:
             flags = FD_FDF | (FD_BRS if msg.bitrate_switch else 0)
-            raw = FD.pack(can_id, msg.dlc, flags | (FD_ESI if msg.error_state_indicator else 0), bytes(msg.data))
+            raw = FD.pack(
+                can_id, msg.dlc, flags | (FD_ESI if msg.error_state_indicator else 0), bytes(msg.data)
+            )
         else:
             raw = CLASSIC.pack(can_id, msg.dlc, bytes(msg.data))
         try:

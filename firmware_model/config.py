@@ -111,9 +111,7 @@ class CouplerLoad(Table):
     other_side_rad_s: Finite = 0.0
 
 
-Load = Annotated[
-    ConstantLoad | StepLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")
-]
+Load = Annotated[ConstantLoad | StepLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")]
 
 
 class Disturbance(Table):

@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config as numba_config
 
-numba.config.CPU_NAME = "generic"
-numba.config.CPU_FEATURES = ""
+config: Any = numba_config  # its attributes are made at run time
+config.CPU_NAME = "generic"
+config.CPU_FEATURES = ""
 
 
 def cache_folder(root: Path) -> Path:
@@ -28,7 +30,7 @@ def cache_folder(root: Path) -> Path:
     return base / digest.hexdigest()[:16]
 
 
-numba.config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[1]))
+config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[1]))
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -15,7 +15,7 @@ from firmware_model.plant import MAX_LOADS, LoadKind
 
 
 def coupler_torque_max(torque_at_zero_gap: float, gap_m: float, decay_length_m: float) -> float:
-    """T_max(gap) = T_0 e^{-2 gap / decay}: the field falls by e per decay length (pole pitch / pi), T with B^2."""
+    """T_max(gap) = T_0 e^{-2 gap / decay}: B falls by e per decay length, T goes with B^2."""
     return torque_at_zero_gap * math.exp(-2.0 * gap_m / decay_length_m)
 
 

@@ -207,4 +207,5 @@ class Node:
         """One line: state at the end and what was ignored."""
         state = State(int(self.state["state"])).name
         ignored = ", ".join(f"{count} {name}" for name, count in sorted(self.ignored.items())) or "none"
-        return f"emulator stopped: state {state}, error 0x{int(self.state['error']):04X}, ignored frames: {ignored}"
+        error = int(self.state["error"])
+        return f"emulator stopped: state {state}, error 0x{error:04X}, ignored frames: {ignored}"

@@ -40,7 +40,7 @@ def normal(s: Any) -> float:
 @jit
 def to_wire(value: float, lsb: float, top: float) -> float:
     """Round to the wire's resolution and saturate at +-top; + 0.0 since the wire has no negative zero."""
-    return min(max(np.rint(value / lsb) * lsb, -top), top) + 0.0
+    return float(min(max(np.rint(value / lsb) * lsb, -top), top) + 0.0)
 
 
 @jit

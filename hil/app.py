@@ -95,7 +95,9 @@ class RunResult:
 def wire_facts(database: Database) -> WireFacts:
     """What the kernel needs of a DBC of the house protocol. Raises DatabaseError."""
     command = database.message("COMMAND", "Counter", "Controlword", "VoltageQ", "VoltageD")
-    feedback = database.message("FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State").signals
+    feedback = database.message(
+        "FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State"
+    ).signals
     load = database.messages.get("LOAD_COMMAND", command).signals.get("LoadTorque")
     voltage = command.signals["VoltageQ"]
     return WireFacts(
@@ -137,7 +139,7 @@ def log_path(setup: Setup, kind: str) -> Path:
 def _git_commit() -> str:
     try:
         return subprocess.run(
-            ["git", "rev-parse", "HEAD"],  # noqa: S607 - whatever git the user has
+            ["git", "rev-parse", "HEAD"],
             cwd=Path(__file__).parent,
             capture_output=True,
             text=True,
@@ -193,7 +195,9 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def opened_client(setup: Setup, recorder: Recorder | None, clock: RealClock | LockstepClock) -> Iterator[DriveClient]:
+def opened_client(
+    setup: Setup, recorder: Recorder | None, clock: RealClock | LockstepClock
+) -> Iterator[DriveClient]:
     """A drive client on the configured bus, closed in the end."""
     link = open_link(bus_settings(setup.config))
     client = DriveClient(
@@ -251,7 +255,11 @@ def _await_drive(setup: Setup, client: DriveClient) -> None:
     timeout_s = setup.config.drive.heartbeat_timeout_s
     if not client.wait_for_drive(timeout_s):
         bus = setup.config.bus
-        hint = f"start it: hil emulate {setup.path}" if is_emulated_bus(setup.config) else "is it powered and wired?"
+        hint = (
+            f"start it: hil emulate {setup.path}"
+            if is_emulated_bus(setup.config)
+            else "is it powered and wired?"
+        )
         raise ArmingError(
             f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, nothing was sent; {hint}"
         )
@@ -265,7 +273,11 @@ def plan_of(config: RunConfig) -> Plan:
 
 
 def _run_armed(
-    setup: Setup, client: DriveClient, recorder: Recorder, clock: RealClock | LockstepClock, request: StopRequest
+    setup: Setup,
+    client: DriveClient,
+    recorder: Recorder,
+    clock: RealClock | LockstepClock,
+    request: StopRequest,
 ) -> RunResult:
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
     loop = Loop(client, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)

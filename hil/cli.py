@@ -32,7 +32,11 @@ def _bus_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument("-b", "--bitrate", type=int, help="bitrate [bit/s]")
     group.add_argument("--fd", action="store_true", help="CAN FD")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a config key, e.g. loop.rate_hz=500"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a config key, e.g. loop.rate_hz=500",
     )
 
 
@@ -142,27 +146,43 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
         return command
 
-    demo = add("demo", cmd_demo, "Start the emulator, close the loop, step the load, replay, show what happened.")
+    demo = add(
+        "demo", cmd_demo, "Start the emulator, close the loop, step the load, replay, show what happened."
+    )
     demo.add_argument("config", nargs="?", type=Path, help="configuration (default: configs/demo.toml)")
     _bus_flags(demo)
     demo.add_argument("--lockstep", action="store_true", help="no real time: reproducible to the bit")
-    run = add("run", cmd_run, "Close the loop on the bus of CONFIG. Sends nothing before the drive was armed.")
+    run = add(
+        "run", cmd_run, "Close the loop on the bus of CONFIG. Sends nothing before the drive was armed."
+    )
     run.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
     run.add_argument("--arm", action="store_true", help="allow voltage on a bus that is not emulated")
     run.add_argument("--duration", type=float, metavar="S", help="stop after S seconds")
     run.add_argument("--lockstep", action="store_true", help="the emulator advances by one period a SYNC")
     _bus_flags(run)
     emulate = add("emulate", cmd_emulate, "Serve the emulated drive that CONFIG names until Ctrl-C.")
-    emulate.add_argument("config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table")
+    emulate.add_argument(
+        "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"
+    )
     emulate.add_argument("--lockstep", action="store_true", help="advance by one period a SYNC")
-    emulate.add_argument("--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key")
+    emulate.add_argument(
+        "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
+    )
     _bus_flags(emulate)
-    simulate = add("simulate", cmd_simulate, "Run controller and emulated motor in one process without a bus.")
-    simulate.add_argument("config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table")
+    simulate = add(
+        "simulate", cmd_simulate, "Run controller and emulated motor in one process without a bus."
+    )
+    simulate.add_argument(
+        "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"
+    )
     simulate.add_argument("--duration", type=float, metavar="S", help="simulate S seconds")
-    simulate.add_argument("--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key")
+    simulate.add_argument(
+        "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
+    )
     _bus_flags(simulate)
-    replay = add("replay", cmd_replay, "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 cannot.")
+    replay = add(
+        "replay", cmd_replay, "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 cannot."
+    )
     replay.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
     return parser
 
@@ -175,7 +195,7 @@ def main(argv: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         _say("hil: interrupted")
         return 130
-    except Exception as error:  # noqa: BLE001 - decided below: known errors are one line, others a traceback
+    except Exception as error:
         if not _is_refusal(error):
             raise
         _say("\n".join(f"hil: {line}" for line in str(error).splitlines()))

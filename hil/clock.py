@@ -55,7 +55,9 @@ class FakeClock:
 
     name = "fake"
 
-    def __init__(self, lateness_ns: Iterable[int] = (), on_sleep: Callable[[int], None] | None = None) -> None:
+    def __init__(
+        self, lateness_ns: Iterable[int] = (), on_sleep: Callable[[int], None] | None = None
+    ) -> None:
         self._now_ns = 0
         self._lateness = iter(lateness_ns)
         self._on_sleep = on_sleep

@@ -14,8 +14,16 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo
-from pydantic import field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from hil.errors import ConfigError
 
@@ -351,8 +359,12 @@ def _keys_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
     """Keys of the table at ``loc``; for a union of tables, of all its members that the tag names."""
     models: list[type[BaseModel]] = [model]
     for part in loc:
-        found = [m for owner in models if part in owner.model_fields
-                 for m in _models_in(owner.model_fields[part].annotation)]
+        found = [
+            m
+            for owner in models
+            if part in owner.model_fields
+            for m in _models_in(owner.model_fields[part].annotation)
+        ]
         models = found or [m for m in models if part in _tags(m)] or models
     return [key for m in models for key in m.model_fields]
 

@@ -8,9 +8,11 @@ import subprocess
 import sys
 import uuid
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from firmware_model.config import PlantMotor
 from hil.app import Overrides, RunResult, Setup, load_setup, run
@@ -44,7 +46,7 @@ def emulator_process(path: Path, overrides: Overrides, plant_settings: tuple[str
         command += ["--set", setting]
     for setting in plant_settings:
         command += ["--plant-set", setting]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)  # noqa: S603
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None  # noqa: S101 - PIPE was asked for
     try:
         line = process.stdout.readline()
@@ -65,11 +67,13 @@ def resolution_bound(setup: Setup) -> float:
     spec = law_spec(setup.config)
     T_s = 1.0 / setup.config.loop.rate_hz
     model = sampled_model(motor_model(setup.config.motor), T_s)
-    limits = bounds(law_window(spec, T_s), model.Ad, model.Ed, T_s, list(setup.wire.x_lsb))
+    limits = bounds(law_window(spec, T_s), model.Ad, model.Ed, T_s, np.array(setup.wire.x_lsb))
     return float(limits.resolution[0])
 
 
-def summary(setup: Setup, ticks: TickArray, result: RunResult, verdict: Verdict, true: MotorModel) -> dict[str, Any]:
+def summary(
+    setup: Setup, ticks: TickArray, result: RunResult, verdict: Verdict, true: MotorModel
+) -> dict[str, Any]:
     """The demo's result, as ``--json`` prints it."""
     N = int(setup.machine.law["N"][0, 0])
     step: LoadStep | None = load_step(ticks, N, motor_model(setup.config.motor), true)
@@ -103,10 +107,7 @@ def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
     """Run the demo; raises HilError with one clear line."""
     path = path or find_config("demo.toml")
     if overrides.channel is None:
-        overrides = Overrides(
-            overrides.interface, f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}", overrides.bitrate, overrides.fd,
-            overrides.settings,
-        )  # fmt: skip
+        overrides = replace(overrides, channel=f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}")
     setup = load_setup(path, overrides)
     plant, _ = load_plant(path, setup.config)
     with emulator_process(path, overrides):

@@ -18,7 +18,7 @@ from hil.errors import ConfigError
 def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None) -> tuple[PlantConfig, Path]:
     """The plant that a run configuration names, and the folder of its file."""
     if config.emulator is None:
-        raise ConfigError(str(path), ["emulator: missing; add [emulator] with plant = \"plants/demo.toml\""])
+        raise ConfigError(str(path), ['emulator: missing; add [emulator] with plant = "plants/demo.toml"'])
     plant_path = path.parent / config.emulator.plant
     return load_toml(plant_path, PlantConfig, settings or []), plant_path.parent
 
@@ -39,7 +39,8 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         truth=plant.truth,
     )
     bus = config.bus
-    what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {plant.motor.name or 'inline'}, {config.loop.clock}"
+    motor = plant.motor.name or "inline"
+    what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {motor}, {config.loop.clock}"
     return node, link, what
 
 
@@ -49,7 +50,9 @@ def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     node, link, what = make_node(path, config, plant_settings)
     node.warm_up()
     if config.loop.clock == "realtime":
-        below = config.realtime.model_copy(update={"fifo_priority": max(0, config.realtime.fifo_priority - 1)})
+        below = config.realtime.model_copy(
+            update={"fifo_priority": max(0, config.realtime.fifo_priority - 1)}
+        )
         realtime.acquire(below.model_copy(update={"cpu": None}))
     stopped = False
 

@@ -51,7 +51,8 @@ class LoadStep:
 
 def operating(ticks: TickArray) -> TickArray:
     """Ticks in which operation is enabled."""
-    return ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
+    own: TickArray = ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
+    return own
 
 
 def tracking_rms(ticks: TickArray) -> float:

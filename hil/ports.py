@@ -45,6 +45,9 @@ class Clock(Protocol):
     def sleep_until(self, deadline_ns: int) -> int:
         """Wait until the deadline and return the time of waking."""
 
+    def receive_deadline(self, deadline_ns: int, timeout_ns: int) -> int:
+        """Latest monotonic time at which the feedback of a tick may come."""
+
 
 class Recorder(Protocol):
     """Takes records without ever blocking; drops are counted."""

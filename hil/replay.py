@@ -52,7 +52,12 @@ class Verdict:
     def as_dict(self) -> dict[str, Any]:
         """JSON form; values that are not finite as text, since JSON has none."""
         first = self.first_difference
-        out: dict[str, Any] = {"verdict": self.verdict, "ticks": self.ticks, "first_difference": None, "why": self.why}
+        out: dict[str, Any] = {
+            "verdict": self.verdict,
+            "ticks": self.ticks,
+            "first_difference": None,
+            "why": self.why,
+        }
         if first is not None:
             out["first_difference"] = {
                 "tick": first.tick,
@@ -130,7 +135,9 @@ def replay_log(log: Log) -> Verdict:
         return Verdict("cannot", 0, why=log.damage or "the log has no ticks")
     gaps, ticks = log.gaps, log.ticks
     if int(ticks["k"][0]) != 0:
-        return Verdict("cannot", 0, why=f"the log begins at tick {int(ticks['k'][0])}; its beginning is missing")
+        return Verdict(
+            "cannot", 0, why=f"the log begins at tick {int(ticks['k'][0])}; its beginning is missing"
+        )
     if gaps:
         k, missing = gaps[0]
         ticks = ticks[: int(np.searchsorted(ticks["k"], k))]

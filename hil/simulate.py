@@ -68,8 +68,19 @@ def ended(t: Any) -> bool:
 
 @jit
 def simulate_block(
-    sp: Any, ss: Any, lp: Any, ls: Any, rp: Any, pp: Any, ps: Any, out: Any, tick: Any, ticks: Any, k: int,
-    period_ns: int, stop_at: int
+    sp: Any,
+    ss: Any,
+    lp: Any,
+    ls: Any,
+    rp: Any,
+    pp: Any,
+    ps: Any,
+    out: Any,
+    tick: Any,
+    ticks: Any,
+    k: int,
+    period_ns: int,
+    stop_at: int,
 ) -> int:
     """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended."""
     t = tick[0]
@@ -87,7 +98,7 @@ def simulate_block(
         ticks[j] = tick[0]
         if ended(t):
             return j + 1
-    return ticks.shape[0]
+    return int(ticks.shape[0])
 
 
 @dataclass(slots=True)

@@ -57,7 +57,9 @@ def demo_table(result: dict[str, Any]) -> Table:
         "ticks": f"{result['ticks']}, {result['skipped']} skipped, {result['dropped']} records dropped",
         "lateness": " / ".join(f"{late[key]:.0f}" for key in ("p50", "p99", "p999", "max"))
         + " us (p50 / p99 / p99.9 / max)",
-        "granted": ", ".join(f"{g['what']}: {g['detail'] if g['granted'] else 'no, ' + g['detail']}" for g in result["grants"])
+        "granted": ", ".join(
+            f"{g['what']}: {g['detail'] if g['granted'] else 'no, ' + g['detail']}" for g in result["grants"]
+        )
         or "nothing asked (lockstep)",
         "ended": result["ended"],
         "replay": verdict_text(replay),
@@ -69,7 +71,9 @@ def demo_table(result: dict[str, Any]) -> Table:
 def verdict_text(replay: dict[str, Any]) -> str:
     """A verdict in one line."""
     first = replay["first_difference"]
-    text = {"same": f"same to the bit, {replay['ticks']} ticks", "cannot": "cannot"}.get(replay["verdict"], "differs")
+    text = {"same": f"same to the bit, {replay['ticks']} ticks", "cannot": "cannot"}.get(
+        replay["verdict"], "differs"
+    )
     if first:
         text += (
             f" from tick {first['tick']} on: {first['field']} logged {first['logged']}, "

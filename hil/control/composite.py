@@ -46,7 +46,7 @@ def continuous_gain(A: Array, B: Array, Upsilon: Array, Z: Array) -> Array:
 
 
 def composite_gain(model: SampledModel, Upsilon: Array, Z: Array) -> CompositeGain:
-    """Sampled gain Pi_d = Bd^-1 (Z e^{Upsilon T_s} Z^-1 - Ad): the closed loop has e^{Upsilon T_s} exactly."""
+    """Sampled gain Pi_d = Bd^-1 (Z e^{Upsilon T_s} Z^-1 - Ad): closed loop e^{Upsilon T_s} exactly."""
     _, Upsilon, Z = _check(model.B, Upsilon, Z)
     closed = Z @ expm(Upsilon * model.T_s) @ np.linalg.inv(Z)
     Bd_inv = np.linalg.inv(model.Bd)

@@ -239,7 +239,7 @@ def start(p: Any, s: Any) -> None:
 
 @jit
 def open_loop(p: Any, s: Any) -> None:
-    """Advance the prediction with d = 0 by one period of the applied input: x_open <- Ad x_open + Bd ua + Ed c."""
+    """Advance the prediction with d = 0 by one period: x_open <- Ad x_open + Bd ua + Ed c."""
     matvec(p["Ad"], s["x_open"], s["work"])
     matvec_add(p["Bd"], s["ua"], s["work"])
     matvec_add(p["Ed"], s["c"], s["work"])

@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
-from hil.control.linalg import Array
+from hil.control.linalg import Array, Index
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Window:
     lam: Array
     lam_N: Array
     theta: Array
-    N: np.ndarray[tuple[int], np.dtype[np.int64]]
+    N: Index
 
     @property
     def n(self) -> int:
@@ -40,7 +40,7 @@ class Window:
 def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) -> Window:
     """FTDOB of Theorem 1: Theta = [I 0] [G, Lam^N G]^-1, N = round(D / T_s), per channel.
 
-    gamma_1, gamma_2 [rad/s] (n,), delay D [s] scalar or (n,). With diagonal Gamma the inverse is, per channel,
+    gamma_1, gamma_2 [rad/s] (n,), delay D [s] scalar or (n,). With diagonal Gamma the inverse is per channel
     theta_1 = -lam_2^N / (lam_1^N - lam_2^N), theta_2 = lam_1^N / (lam_1^N - lam_2^N).
     Raises ControlDesignError that names the violated condition.
     """
@@ -48,7 +48,9 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
     n = gamma.shape[1]
     delay = np.broadcast_to(np.asarray(delay_s, float), (n,))
     if not (np.isfinite(gamma).all() and (gamma > 0).all()):
-        raise ControlDesignError(f"Gamma must be a positive diagonal matrix (Theorem 1, 1), not {gamma.ravel()}")
+        raise ControlDesignError(
+            f"Gamma must be a positive diagonal matrix (Theorem 1, 1), not {gamma.ravel()}"
+        )
     if (delay < T_s * 0.999999).any() or not np.isfinite(delay).all():
         raise ControlDesignError(f"D = {delay.min()} s is shorter than a tick, T_s = {T_s} s; lengthen D")
     if (gamma[0] == gamma[1]).any():
@@ -57,9 +59,9 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
             f"equal poles in channel {channel}: gamma_1 = gamma_2 = {gamma[0, channel]} rad/s makes "
             "[G, Lam^N G] singular (Theorem 1, 2); move one of them"
         )
-    N = np.rint(delay / T_s).astype(np.int64)
+    N: Index = np.rint(delay / T_s).astype(np.int64)
     lam = np.exp(-gamma * T_s)
-    lam_N = lam**N
+    lam_N: Array = lam**N
     determinant = lam_N[1] - lam_N[0]
     if (np.abs(determinant) < 1e-9).any():
         channel = int(np.argmin(np.abs(determinant)))
@@ -100,7 +102,7 @@ def window_step(
     lam: Array,
     lam_N: Array,
     theta: Array,
-    N: Array,
+    N: Index,
     v: Array,
     h: Array,
     past: Array,
@@ -125,7 +127,7 @@ def window_step(
     for c in range(v.shape[0]):
         for i in range(2):
             past[new_head, i, c] = h[i, c]
-    return new_head
+    return int(new_head)
 
 
 @jit

@@ -79,7 +79,12 @@ def test_the_demo_says_what_happened(configs: Path, settings: Settings) -> None:
     done = call("demo", str(configs / "demo.toml"), "--json", *flags(settings("loop.duration_s=4.0")))
     result = json.loads(done.stdout)
     assert done.returncode == 0, done.stderr
-    assert result["replay"] == {"verdict": "same", "ticks": result["ticks"] + 1, "first_difference": None, "why": ""}
+    assert result["replay"] == {
+        "verdict": "same",
+        "ticks": result["ticks"] + 1,
+        "first_difference": None,
+        "why": "",
+    }
     assert set(result["lateness_us"]) == {"p50", "p99", "p999", "max"}
     assert result["ticks"] + result["skipped"] >= 3990
     assert 2.0 < result["dip_rad_s"] < 8.0 and 20 < result["recovery_ms"] < 300
@@ -104,7 +109,9 @@ def test_lockstep_twice_and_simulated_are_the_same_to_the_bit(configs: Path, set
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_stop_safely(configs: Path, settings: Settings, tmp_path: Path, number: signal.Signals) -> None:
+def test_signals_stop_safely(
+    configs: Path, settings: Settings, tmp_path: Path, number: signal.Signals
+) -> None:
     own = settings("loop.duration_s=60.0")
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
@@ -150,7 +157,10 @@ def emergency_of(bus: can.BusABC) -> int:
 def test_a_drive_that_dies_ends_the_run(configs: Path, settings: Settings, tmp_path: Path) -> None:
     own = settings("loop.duration_s=60.0")
     path = configs / "demo.toml"
-    with emulator_process(path, Overrides(settings=own)) as pid, hil("run", str(path), *flags(own)) as process:
+    with (
+        emulator_process(path, Overrides(settings=own)) as pid,
+        hil("run", str(path), *flags(own)) as process,
+    ):
         wait_for_log(tmp_path)
         os.kill(pid, signal.SIGKILL)
         out, _ = process.communicate(timeout=30)
@@ -166,7 +176,9 @@ def test_without_a_drive_nothing_is_sent(configs: Path, settings: Settings, chan
         done = call("run", str(configs / "demo.toml"), *flags(settings("drive.heartbeat_timeout_s=0.3")))
         assert bus.recv(0.1) is None
     assert done.returncode == 2
-    assert done.stderr.startswith("hil: no drive heard on hil-local:") and "start it: hil emulate" in done.stderr
+    assert (
+        done.stderr.startswith("hil: no drive heard on hil-local:") and "start it: hil emulate" in done.stderr
+    )
     assert len(done.stderr.splitlines()) == 1
 
 
@@ -192,7 +204,9 @@ def test_refusals_are_one_clear_line(configs: Path, settings: Settings, override
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_frame_flood_and_a_second_master_end_safely(configs: Path, settings: Settings, tmp_path: Path, channel: str) -> None:
+def test_a_frame_flood_and_a_second_master_end_safely(
+    configs: Path, settings: Settings, tmp_path: Path, channel: str
+) -> None:
     own = settings("loop.duration_s=60.0")
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:

@@ -40,7 +40,8 @@ def test_there_is_something_to_check() -> None:
 @pytest.mark.parametrize("path", files("hil/control"), ids=lambda p: p.name)
 def test_control_is_pure(path: Path) -> None:
     foreign = {
-        m for m in imports(path) - starts(imports(path), "hil.control", "numpy", "scipy", "numba")
+        m
+        for m in imports(path) - starts(imports(path), "hil.control", "numpy", "scipy", "numba")
         if m.split(".")[0] not in STDLIB_OK
     }
     assert not foreign

@@ -88,5 +88,7 @@ def test_tables_must_increase(configs: Path, tmp_path: Path) -> None:
     text = (configs / "demo.toml").read_text()
     start, end = text.index("[reference]"), text.index("[log]")
     path = tmp_path / "c.toml"
-    path.write_text(text[:start] + '[reference]\nkind="table"\nt_s=[0.0,0.0]\nw_rad_s=[0.0,1.0]\n' + text[end:])
+    path.write_text(
+        text[:start] + '[reference]\nkind="table"\nt_s=[0.0,0.0]\nw_rad_s=[0.0,1.0]\n' + text[end:]
+    )
     assert "t_s must increase" in problems(path)

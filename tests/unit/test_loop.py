@@ -177,7 +177,9 @@ def test_stop_asked_twice_is_a_quick_stop() -> None:
 
 def test_a_run_without_length_goes_on_until_it_is_stopped() -> None:
     drive = ScriptedDrive()
-    loop, memory, request = make(drive, FakeClock(on_sleep=lambda d: request.stop() if d == 50 * MS else None), None)
+    loop, _, request = make(
+        drive, FakeClock(on_sleep=lambda d: request.stop() if d == 50 * MS else None), None
+    )
     assert loop.run().ticks == 50
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -63,7 +64,9 @@ class Bench:
                 return self
         raise AssertionError("the handshake does not end")
 
-    def until_over(self, flags: int = FRESH, limit: int = 200, **inputs: float) -> list[tuple[int, int, float, int]]:
+    def until_over(
+        self, flags: int = FRESH, limit: int = 200, **inputs: float
+    ) -> list[tuple[int, int, float, int]]:
         """Step until the supervisor has ended; rows of (state, controlword, |u|, send)."""
         rows = []
         for _ in range(limit):
@@ -98,14 +101,19 @@ def test_handshake_in_order_with_zero_voltage(bench: Bench) -> None:
         if t["state"] == DriveState.OPERATION_ENABLED:
             break
     words = [word for word, _ in seen]
-    assert words == [Controlword.SHUTDOWN, Controlword.SWITCH_ON, Controlword.ENABLE_OPERATION, Controlword.ENABLE_OPERATION]
+    assert words == [
+        Controlword.SHUTDOWN,
+        Controlword.SWITCH_ON,
+        Controlword.ENABLE_OPERATION,
+        Controlword.ENABLE_OPERATION,
+    ]
     assert all(u == 0.0 for _, u in seen[:-1])
 
 
 def test_a_drive_in_fault_is_reset_by_a_rising_edge(bench: Bench) -> None:
     bench.obedient, bench.drive = False, int(DriveState.FAULT)
     words = [int(bench.step()["controlword"]) for _ in range(4)]
-    assert 0x80 in words and any(a & 0x80 == 0 and b & 0x80 for a, b in zip(words, words[1:], strict=False))
+    assert 0x80 in words and any(a & 0x80 == 0 and b & 0x80 for a, b in itertools.pairwise(words))
 
 
 def test_a_drive_that_never_enables_times_out() -> None:
@@ -141,7 +149,9 @@ STOPS: list[tuple[str, Reason, int, dict[str, float], int]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "reason", "flags", "inputs", "tolerated"), STOPS, ids=[row[0] for row in STOPS])
+@pytest.mark.parametrize(
+    ("name", "reason", "flags", "inputs", "tolerated"), STOPS, ids=[row[0] for row in STOPS]
+)
 def test_every_cause_stops_with_its_reason_and_zero_voltage(
     bench: Bench, name: str, reason: Reason, flags: int, inputs: dict[str, float], tolerated: int
 ) -> None:
@@ -155,7 +165,9 @@ def test_every_cause_stops_with_its_reason_and_zero_voltage(
     rows = bench.until_over(flags, **inputs)
     assert all(u == 0.0 for _, _, u, _ in rows)
     after = [bench.step(request=int(Request.ARM)) for _ in range(3)]
-    assert all(t["send"] == 0 and t["state"] != DriveState.OPERATION_ENABLED for t in after), "no automatic resume"
+    assert all(t["send"] == 0 and t["state"] != DriveState.OPERATION_ENABLED for t in after), (
+        "no automatic resume"
+    )
 
 
 def test_at_the_limit_is_allowed(bench: Bench) -> None:
@@ -272,5 +284,3 @@ def _random_rows(rng: np.random.Generator, count: int) -> Iterable[dict[str, Any
             "w_ref": rng.choice(strange) if odd else 50.0,
             "request": int(rng.choice([1, 1, 1, 1, 3, 4])) if rng.random() < 0.02 else 1,
         }
-
-
