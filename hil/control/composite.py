@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from hil.control.errors import ControlDesignError
-from hil.control.fac import SampledModel
+from hil.control.fac import SINGULAR, SampledModel
 from hil.control.jit import jit
 from hil.control.linalg import Array, matvec, matvec_add
 
@@ -26,14 +26,14 @@ class CompositeGain:
 def _check(B: Array, Upsilon: Array, Z: Array) -> tuple[Array, Array, Array]:
     """Conditions of Theorem 2: B square and invertible, Upsilon Hurwitz, det(Z) != 0."""
     B, Upsilon, Z = (np.array(m, float) for m in (B, Upsilon, Z))
-    if B.ndim != 2 or B.shape[0] != B.shape[1] or np.linalg.cond(B) > 1e13:
+    if B.ndim != 2 or B.shape[0] != B.shape[1] or np.linalg.cond(B) > SINGULAR:
         raise ControlDesignError(f"B must be square and invertible (full actuation), not {B.tolist()}")
     if Upsilon.shape != B.shape or Z.shape != B.shape:
         raise ControlDesignError(f"Upsilon and Z must have the shape of B, {B.shape}")
     poles = np.linalg.eigvals(Upsilon)
     if not (poles.real < 0).all():
         raise ControlDesignError(f"Upsilon must be Hurwitz (Theorem 2, 1), but has the eigenvalues {poles}")
-    if np.linalg.cond(Z) > 1e13:
+    if np.linalg.cond(Z) > SINGULAR:
         raise ControlDesignError("Z must be non-singular (Theorem 2, 2)")
     return B, Upsilon, Z
 

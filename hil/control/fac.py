@@ -16,6 +16,9 @@ from hil.control.linalg import Array
 MAX_GAP = 64
 """Longest gap in the measurements [ticks] that a gap inverse is kept for."""
 
+SINGULAR = 1e13
+"""Condition number above which a matrix counts as singular."""
+
 
 @dataclass(frozen=True, slots=True)
 class SampledModel:
@@ -23,7 +26,7 @@ class SampledModel:
 
     ``A`` (n, n), ``B`` (n, m), ``T_s`` [s]; ``Ad = e^{A T_s}``, ``Ed = int_0^{T_s} e^{A s} ds``,
     ``Bd = Ed B``; ``gap_inverse[m - 1] = (sum_{j<m} Ad^j Ed)^-1`` for gaps of m ticks, so
-    ``gap_inverse[0] = Ed^-1``.
+    ``gap_inverse[0] = Ed^-1``; it has as many entries as are regular one after another.
     """
 
     A: Array
@@ -43,8 +46,8 @@ class SampledModel:
 def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledModel:
     """Sample x' = A x + B u + d exactly with the matrix exponential of [[A, I], [0, 0]] T_s.
 
-    Raises ControlDesignError for shapes that do not fit, a T_s that is not positive, and a singular
-    gap sum (A then has eigenvalues 2 pi j / (m T_s) apart; take another T_s).
+    Raises ControlDesignError for shapes that do not fit, a T_s that is not positive, and a singular Ed
+    (A then has an eigenvalue 2 pi j k / T_s; take another T_s). A singular gap sum only ends ``gap_inverse``.
     """
     A, B = np.array(A, float), np.array(B, float)
     n = A.shape[0] if A.ndim == 2 else 0
@@ -62,21 +65,21 @@ def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledMod
 
 
 def _gap_inverses(Ad: Array, Ed: Array, max_gap: int) -> Array:
-    """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap; shape (max_gap, n, n)."""
+    """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap or the last regular one; shape (count, n, n)."""
     n = Ad.shape[0]
-    inverses = np.empty((max_gap, n, n))
+    inverses: list[Array] = []
     power, total = np.eye(n), np.zeros((n, n))
-    for m in range(max_gap):
+    while len(inverses) < max_gap:
         total = total + power @ Ed
         power = power @ Ad
-        scale = float(np.abs(total).max())
-        if not np.isfinite(scale) or np.linalg.cond(total) > 1e13:
-            if m == 0:
-                raise ControlDesignError("Ed is singular: A has eigenvalues 2 pi j / T_s apart; change T_s")
-            inverses[m:] = np.nan
+        if not np.isfinite(total).all() or np.linalg.cond(total) > SINGULAR:
             break
-        inverses[m] = np.linalg.inv(total)
-    return _frozen(inverses)
+        inverses.append(np.linalg.inv(total))
+    if not inverses:
+        raise ControlDesignError(
+            "Ed is singular or not finite: A has an eigenvalue 2 pi j k / T_s; change T_s"
+        )
+    return _frozen(np.array(inverses))
 
 
 def _frozen(array: Array) -> Array:

@@ -38,6 +38,7 @@ LAW_PARAMS: Final = np.dtype(
         ("Bd", "f8", (3, 3)),
         ("Ed", "f8", (3, 3)),
         ("gap_inverse", "f8", (MAX_GAP, 3, 3)),
+        ("max_gap", "i8"),
         ("lam", "f8", (2, 3)),
         ("lam_N", "f8", (2, 3)),
         ("theta", "f8", (2, 3)),
@@ -179,7 +180,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "Ad": model.Ad,
         "Bd": model.Bd,
         "Ed": model.Ed,
-        "gap_inverse": model.gap_inverse,
+        "max_gap": len(model.gap_inverse),
         "lam": window.lam,
         "lam_N": window.lam_N,
         "theta": window.theta,
@@ -201,6 +202,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
     }
     for name, value in values.items():
         params[name] = value
+    params["gap_inverse"][0, : len(model.gap_inverse)] = model.gap_inverse
     return params
 
 
@@ -262,13 +264,13 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     """Advance the observer by the past ``periods`` ticks, in which s['ua'] was applied.
 
     Without a fresh measurement only the gap grows; the next one then makes up for all of it exactly. The
-    memory starts filled with the first innovation (bumpless). A gap over MAX_GAP ticks starts anew.
+    memory starts filled with the first innovation (bumpless). A gap over max_gap ticks starts anew.
     """
     if s["started"]:
-        for _ in range(min(periods, MAX_GAP + 1)):
+        for _ in range(min(periods, p["max_gap"] + 1)):
             open_loop(p, s)
         s["gap"] += periods
-        if s["gap"] > MAX_GAP:
+        if s["gap"] > p["max_gap"]:
             reset(s)
     if not fresh:
         return

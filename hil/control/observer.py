@@ -17,6 +17,12 @@ from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
 from hil.control.linalg import Array, Index
 
+SINGULAR = 1e-9
+"""|lam_1^N - lam_2^N| / max lam^N at and below which Theorem 1's matrix counts as singular (Theta > 1e9)."""
+
+MAX_RESPONSE = 1 << 20
+"""Longest impulse response that is summed for a bound [ticks]."""
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -44,9 +50,13 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
     theta_1 = -lam_2^N / (lam_1^N - lam_2^N), theta_2 = lam_1^N / (lam_1^N - lam_2^N).
     Raises ControlDesignError that names the violated condition.
     """
-    gamma = np.array([gamma_1, gamma_2], float).reshape(2, -1)
-    n = gamma.shape[1]
-    delay = np.broadcast_to(np.asarray(delay_s, float), (n,))
+    first, second, delay = (np.atleast_1d(np.asarray(a, float)) for a in (gamma_1, gamma_2, delay_s))
+    if first.ndim != 1 or second.shape != first.shape or delay.shape not in ((1,), first.shape):
+        raise ControlDesignError(
+            "gamma_1, gamma_2 and D need one entry per channel, "
+            f"not {first.shape}, {second.shape}, {delay.shape}"
+        )
+    gamma, delay = np.array([first, second]), np.broadcast_to(delay, first.shape)
     if not (np.isfinite(gamma).all() and (gamma > 0).all()):
         raise ControlDesignError(
             f"Gamma must be a positive diagonal matrix (Theorem 1, 1), not {gamma.ravel()}"
@@ -63,11 +73,13 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
     lam = np.exp(-gamma * T_s)
     lam_N: Array = lam**N
     determinant = lam_N[1] - lam_N[0]
-    if (np.abs(determinant) < 1e-9).any():
-        channel = int(np.argmin(np.abs(determinant)))
+    singular = np.abs(determinant) <= SINGULAR * lam_N.max(axis=0)  # relative: both lam^N may be tiny
+    if singular.any():
+        channel = int(np.argmax(singular))
         raise ControlDesignError(
-            f"[G, Lam^N G] is singular in channel {channel} to working precision: |lam_1^N - lam_2^N| = "
-            f"{abs(determinant[channel]):.1e} (Theorem 1, 2); move the poles apart or change D"
+            f"[G, Lam^N G] is singular in channel {channel} to working precision: lam_1^N = "
+            f"{lam_N[0, channel]:.6g}, lam_2^N = {lam_N[1, channel]:.6g} (Theorem 1, 2); "
+            "move the poles apart or change D"
         )
     return Window(lam, lam_N, np.array([lam_N[1] / determinant, -lam_N[0] / determinant]), N)
 
@@ -168,17 +180,25 @@ class Bounds:
     resolution: Array
 
 
-def bounds(window: Window, Ad: Array, Ed: Array, T_s: float, lsb: Array, length: int = 4096) -> Bounds:
+def response_length(window: Window) -> int:
+    """Ticks after which a unit impulse has left every channel: N + 1; without a window, 1e-16 is left."""
+    endless = (window.lam_N == 0).all(axis=0)
+    ticks = window.N.astype(float) + 1
+    ticks[endless] = np.ceil(np.log(1e-16) / np.log(np.clip(window.lam[0, endless], 1e-300, 1 - 1e-16))) + 1
+    return int(min(ticks.max(), MAX_RESPONSE))
+
+
+def bounds(window: Window, Ad: Array, Ed: Array, T_s: float, lsb: Array) -> Bounds:
     """Bounds of a window on the sampled model; lsb (n,) is the resolution of x on the wire.
 
     x with error e_k gives v the error Ed^-1 (e_k - Ad e_{k-1}); through the window w the error of d_hat is
     sum_j (w_j Ed^-1 - w_{j-1} Ed^-1 Ad) e_{k-j}, whose worst case over |e| <= lsb/2 is its absolute sum.
     """
-    weights = impulse_response(window, length)
+    weights = impulse_response(window, response_length(window))
     inverse = np.linalg.inv(Ed)
     shifted = np.vstack([np.zeros((1, window.n)), weights[:-1]])
     response = weights[:, :, None] * inverse[None] - shifted[:, :, None] * (inverse @ Ad)[None]
-    remaining = np.abs(weights.sum(axis=0) - np.cumsum(weights, axis=0))
+    remaining = np.abs(1.0 - np.cumsum(weights, axis=0))  # the weights of an estimator sum to 1
     return Bounds(
         ramp=(remaining.sum(axis=0) + 0.5) * T_s,
         noise=np.sqrt((response**2).sum(axis=(0, 2))),

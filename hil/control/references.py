@@ -39,6 +39,22 @@ Kind = Literal["step", "ramp", "s-curve", "sine", "table"]
 _KINDS: Final[dict[str, int]] = {"step": STEP, "ramp": RAMP, "s-curve": S_CURVE, "sine": SINE, "table": TABLE}
 
 
+def _check(kind: Kind, rate: float, jerk: float, times: list[float], values: list[float]) -> None:
+    """Refuse slopes that are not positive (an S-curve's must be finite too) and tables out of order."""
+    if not rate > 0 or not jerk > 0:
+        raise ControlDesignError(f"rate and jerk must be positive, not {rate} and {jerk}")
+    if kind == "s-curve" and math.isinf(rate + jerk):
+        raise ControlDesignError("an S-curve needs a finite rate and a finite jerk; or take a ramp")
+    if kind != "table":
+        return
+    if len(times) != len(values) or not 0 < len(times) <= TABLE_MAX:
+        raise ControlDesignError(
+            f"a table needs as many w as t, 1 to {TABLE_MAX}, not {len(values)}, {len(times)}"
+        )
+    if not np.isfinite(times + values).all() or (np.diff(times) < 0).any():
+        raise ControlDesignError("a table must be finite and its times must not go back")
+
+
 def reference(
     kind: Kind,
     *,
@@ -52,10 +68,12 @@ def reference(
     i_q: float = 0.0,
     table: tuple[list[float], list[float]] = ([], []),
 ) -> npt.NDArray[np.void]:
-    """A one-element array of REFERENCE; w [rad/s], times [s], rate [rad/s2], jerk [rad/s3], i_q [A]."""
+    """A one-element array of REFERENCE; w [rad/s], times [s], rate [rad/s2], jerk [rad/s3], i_q [A].
+
+    Raises ControlDesignError when the profile's own numbers are missing or can't be followed.
+    """
     times, values = table
-    if len(times) != len(values) or len(times) > TABLE_MAX:
-        raise ControlDesignError(f"a table needs as many t as w, at most {TABLE_MAX}")
+    _check(kind, rate, jerk, times, values)
     out = np.zeros(1, REFERENCE)
     named = {"w": w, "at": at, "down_at": down_at, "rate": rate, "jerk": jerk, "offset": offset}
     for name, value in (named | {"frequency": frequency, "i_q": i_q, "count": len(times)}).items():
