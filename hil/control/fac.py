@@ -61,10 +61,12 @@ def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledMod
     augmented[:n, :n], augmented[:n, n:] = A, np.eye(n)
     exponential = expm(augmented * T_s)
     Ad, Ed = exponential[:n, :n], exponential[:n, n:]
-    return SampledModel(A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), _gap_inverses(Ad, Ed, max_gap))
+    return SampledModel(
+        A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), _gap_inverses(Ad, Ed, T_s, max_gap)
+    )
 
 
-def _gap_inverses(Ad: Array, Ed: Array, max_gap: int) -> Array:
+def _gap_inverses(Ad: Array, Ed: Array, T_s: float, max_gap: int) -> Array:
     """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap or the last regular one; shape (count, n, n)."""
     n = Ad.shape[0]
     inverses: list[Array] = []
@@ -72,7 +74,7 @@ def _gap_inverses(Ad: Array, Ed: Array, max_gap: int) -> Array:
     while len(inverses) < max_gap:
         total = total + power @ Ed
         power = power @ Ad
-        if not np.isfinite(total).all() or np.linalg.cond(total) > SINGULAR:
+        if _is_singular(total, (len(inverses) + 1) * T_s):
             break
         inverses.append(np.linalg.inv(total))
     if not inverses:
@@ -80,6 +82,14 @@ def _gap_inverses(Ad: Array, Ed: Array, max_gap: int) -> Array:
             "Ed is singular or not finite: A has an eigenvalue 2 pi j k / T_s; change T_s"
         )
     return _frozen(np.array(inverses))
+
+
+def _is_singular(integral: Array, length: float) -> bool:
+    """Whether int_0^length e^{A s} ds is singular, also where all of it cancels: e^{A 0} = I sets the scale."""
+    if not np.isfinite(integral).all():
+        return True
+    sigma = np.linalg.svd(integral, compute_uv=False)
+    return bool(sigma[-1] * SINGULAR < max(sigma[0], length))
 
 
 def _frozen(array: Array) -> Array:
