@@ -85,7 +85,7 @@ def _gap_inverses(Ad: Array, Ed: Array, T_s: float, max_gap: int) -> Array:
 
 
 def _is_singular(integral: Array, length: float) -> bool:
-    """Whether int_0^length e^{A s} ds is singular, also where all of it cancels: e^{A 0} = I sets the scale."""
+    """Whether int_0^length e^{A s} ds is singular, also where all of it cancels; e^{A 0} = I is the scale."""
     if not np.isfinite(integral).all():
         return True
     sigma = np.linalg.svd(integral, compute_uv=False)
