@@ -59,11 +59,11 @@ def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledMod
         raise ControlDesignError(f"T_s must be positive, not {T_s}")
     augmented = np.zeros((2 * n, 2 * n))
     augmented[:n, :n], augmented[:n, n:] = A, np.eye(n)
-    exponential = expm(augmented * T_s)
-    Ad, Ed = exponential[:n, :n], exponential[:n, n:]
-    return SampledModel(
-        A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), _gap_inverses(Ad, Ed, T_s, max_gap)
-    )
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable A may overflow: the checks see it
+        exponential = expm(augmented * T_s)
+        Ad, Ed = exponential[:n, :n], exponential[:n, n:]
+        inverses = _gap_inverses(Ad, Ed, T_s, max_gap)
+    return SampledModel(A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), inverses)
 
 
 def _gap_inverses(Ad: Array, Ed: Array, T_s: float, max_gap: int) -> Array:

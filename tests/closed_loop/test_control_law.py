@@ -1,4 +1,4 @@
-"""The drive laws in closed loop: a plain dq motor of the tests' own, one tick late, resolution of the wire."""
+"""The drive laws in closed loop: a plain dq motor of the tests' own, one tick late, wire resolution."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_stable_in_every_corner(corner: tuple[float, float, float, float]) -> No
     )
     trace = hold_speed(spec(), motor, 1400, 700)
     error = np.abs(trace.x[700:, 0] - 80.0)
-    assert error.max() < 7.0
+    assert error.max() < 7.5
     assert error[-200:].max() < 0.2
     assert np.abs(trace.x[600:700, 0] - 80.0).max() < 0.2
 

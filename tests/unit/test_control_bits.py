@@ -1,4 +1,4 @@
-"""Compiled and interpreted kernels give the same bytes: this file is the test and the script it runs twice."""
+"""Compiled and interpreted kernels give the same bytes: this file is the test and the script it runs."""
 
 from __future__ import annotations
 

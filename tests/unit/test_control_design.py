@@ -145,6 +145,7 @@ def test_sampled_model_is_the_integral(A: np.ndarray) -> None:
         (np.eye(2), np.eye(2), 0.0, "T_s must be positive"),
         (np.eye(2), np.eye(2), math.nan, "T_s must be positive"),
         (rotation(2 * math.pi / 0.1), np.eye(2), 0.1, "Ed is singular"),
+        (np.eye(2) * 2000.0, np.eye(2), 1.0, "not finite"),
     ],
 )
 def test_models_that_can_not_be_sampled(A: np.ndarray, B: np.ndarray, T_s: float, condition: str) -> None:
@@ -155,3 +156,7 @@ def test_models_that_can_not_be_sampled(A: np.ndarray, B: np.ndarray, T_s: float
 def test_gaps_end_where_their_sum_is_singular() -> None:
     """A rotation of a fifth of a turn a tick: after five ticks nothing of a constant d is left to see."""
     assert len(sample(rotation(2 * math.pi / 0.5), np.eye(2), 0.1).gap_inverse) == 4
+
+
+def test_gaps_end_where_an_unstable_sum_overflows() -> None:
+    assert 1 <= len(sample(np.eye(2) * 50.0, np.eye(2), 1.0).gap_inverse) < 20
