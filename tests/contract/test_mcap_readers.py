@@ -69,6 +69,16 @@ def test_every_checksum_holds_and_the_summary_counts(path: Path) -> None:
     assert (statistics.message_start_time, statistics.message_end_time) == (0, 299_000_000)
 
 
+def test_the_chunk_index_points_at_message_indexes(path: Path) -> None:
+    raw = path.read_bytes()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    for chunk in summary.chunk_indexes:
+        for channel, at in chunk.message_index_offsets.items():
+            assert raw[at] == 7 and int.from_bytes(raw[at + 9 : at + 11], "little") == channel
+
+
 def test_attachments_come_back(path: Path) -> None:
     with path.open("rb") as stream:
         found = {record.name: record.data.decode() for record in make_reader(stream).iter_attachments()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import random
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -199,6 +200,28 @@ def bomb(claimed: int, real: int) -> Chunk:
 def test_hostile_chunks_are_named_and_left_out(tmp_path: Path, chunk: Chunk, why: str) -> None:
     log = open_log(hostile(tmp_path / "run.mcap", chunk))
     assert log.damage is not None and why in log.damage and len(log.ticks) == 0
+
+
+def test_a_bomb_that_names_its_size_is_never_unpacked(tmp_path: Path) -> None:
+    path = hostile(tmp_path / "run.mcap", bomb(1000, MAX_CHUNK * 2))
+    tracemalloc.start()
+    try:
+        open_log(path)
+        assert tracemalloc.get_traced_memory()[1] < MAX_CHUNK
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_damaged_attachment_is_named_and_left_out(tmp_path: Path, whole: bytes) -> None:
+    at = whole.index(b"rate_hz = 1000")
+    log = open_log(saved(tmp_path, whole[:at] + b"R" + whole[at + 1 :]))
+    assert "config.toml" not in log.attachments and "config.toml" in (log.damage or "")
+    assert len(log.ticks) == 500
+
+
+def test_ticks_are_joined_across_slabs(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.log.reader.SLAB_TICKS", 64)
+    assert open_log(saved(tmp_path, whole)).ticks.tobytes() == TICKS.tobytes()
 
 
 def test_a_bomb_without_its_size_is_cut_short(tmp_path: Path) -> None:

@@ -69,6 +69,30 @@ def test_a_viewer_sees_the_newest_and_takes_nothing(capacity: int, pushed: int, 
     ring.close()
 
 
+class Overtaken(Ring):
+    """A ring whose producer goes on while a viewer copies; the copy is what it was before or after."""
+
+    pushes = 0
+
+    def _copy(self, start: int, end: int) -> bytes:
+        for _ in range(self.pushes):
+            self.header[4] = self.header[3]
+            self.push(record(self.header[3]))
+        return super()._copy(start, end)
+
+
+@pytest.mark.parametrize("pushes", range(12))
+def test_a_viewer_is_never_shown_what_was_overwritten_meanwhile(pushes: int) -> None:
+    ring = Overtaken.create("test", SIZE, 8)
+    for number in range(20):
+        ring.header[4] = ring.header[3]
+        ring.push(record(number))
+    ring.pushes = pushes
+    expected = list(range(13, 20))[max(0, 20 + pushes + 1 - 8 - 13) :]
+    assert numbers(ring.latest(7)) == expected
+    ring.close()
+
+
 def test_a_record_is_taken_only_at_the_look_after_the_one_that_saw_it() -> None:
     ring = Ring.create("test", SIZE, 4)
     ring.push(record(1))

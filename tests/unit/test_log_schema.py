@@ -49,6 +49,7 @@ def test_frames_are_messages_and_come_back(t_ns: int, can_id: int, data: bytes, 
     raw = messages.tobytes()[: schema.FRAME_HEAD + len(data)]
     decoded = message("hil.CanFrame").FromString(raw)
     assert (decoded.t_ns, decoded.can_id, decoded.data) == (t_ns, can_id, data)
+    messages["data"][0, len(data) :] = 0xEE  # what lies behind a shorter frame is another message
     again = schema.frames_from_messages(messages, np.array([len(raw)]), received)
     assert again.tobytes() == frames.tobytes()
 
