@@ -337,7 +337,7 @@ def test_recover_makes_a_complete_log_and_says_what_is_missing(tmp_path: Path, w
     assert recovery.damage is not None and recovery.ticks == 200 and recovery.last_t_ns == 199_000_000
     log = open_log(tmp_path / "out.mcap")
     assert log.damage is None and log.ticks.tobytes() == TICKS[:200].tobytes()
-    assert (len(log.frames), len(log.events)) == (recovery.frames, recovery.events)
+    assert len(log.frames) == recovery.frames >= 600 and len(log.events) == recovery.events >= 3
     assert log.attachments == HEADER["attachments"] and log.metadata["recovered"]["from"] == "run.mcap"
     assert "result is missing" in log.metadata["recovered"]["damage"]
     assert "recovered" in log.result["ended"]
