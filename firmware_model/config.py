@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
 from firmware_model.load import coupler_torque_max
 from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State
@@ -82,6 +82,12 @@ class StepLoad(Table):
     torque_n_m: Finite
     at_s: NonNegative
     until_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> StepLoad:
+        if self.until_s is not None and self.until_s <= self.at_s:
+            raise ValueError(f"until_s = {self.until_s} is not after at_s = {self.at_s}")
+        return self
 
 
 class SineLoad(Table):

@@ -1,8 +1,9 @@
 """Load torque on the shaft [N m], positive against positive speed; several loads add up.
 
 The coupler is a permanent-magnet eddy-current coupler: torque over slip speed s has the form
-T = T_max 2 (s / s_m) / (1 + (s / s_m)^2) of eddy-current machines, with T_max falling exponentially with the
-air gap (:func:`coupler_torque_max`). The commanded load machine is added by the caller.
+T = T_max 2 (s / s_m) / (1 + (s / s_m)^2) of eddy-current brakes (J. H. Wouterse, "Critical torque and speed
+of eddy current brake with widely separated soft iron poles", IEE Proc. B 138(4), 1991), with T_max falling
+exponentially with the air gap (:func:`coupler_torque_max`). The caller adds the commanded load machine.
 """
 
 from __future__ import annotations
@@ -14,9 +15,13 @@ from firmware_model.jit import jit
 from firmware_model.plant import MAX_LOADS, LoadKind
 
 
-def coupler_torque_max(torque_at_zero_gap: float, gap_m: float, decay_length_m: float) -> float:
-    """T_max(gap) = T_0 e^{-2 gap / decay}: B falls by e per decay length, T goes with B^2."""
-    return torque_at_zero_gap * math.exp(-2.0 * gap_m / decay_length_m)
+def coupler_torque_max(torque_at_zero_gap: float, gap: float, decay_length: float) -> float:
+    """T_max(gap) = T_0 e^{-2 gap / decay}, gap and decay in one unit.
+
+    The field of an array of alternating poles of pitch tau falls as e^{-pi y / tau} (Laplace's equation), so
+    the decay length is tau / pi; the torque goes with the square of the field.
+    """
+    return torque_at_zero_gap * math.exp(-2.0 * gap / decay_length)
 
 
 @jit

@@ -21,6 +21,7 @@ from firmware_model.drive import advance, on_command, on_load_command, on_sync
 from firmware_model.plant import State
 
 PROTOCOL_VERSION = 1
+VOLTAGE_MODE = 0
 HEARTBEAT_NS = 100_000_000
 IDLE_NS = 5_000_000
 
@@ -57,6 +58,7 @@ class Node:
         self._heartbeat_id = database.message("HEARTBEAT").can_id
         self._sync_id = database.message("SYNC").can_id
         self._read_load = self._load.reader("Counter", "Enable", "LoadTorque") if self._load else None
+        self._read_mode = self._command.reader("Mode")
         self._inline_load = "LoadTorque" in self._command.signals
         self._read_command = self._command.reader("Counter", "Controlword", "VoltageQ", "VoltageD")
         self._read_inline = self._command.reader("LoadEnable", "LoadTorque") if self._inline_load else None
@@ -64,7 +66,7 @@ class Node:
         self._state = new_state(params, self._command.counter_modulus - 1)
         self._sample = new_sample()
         self._counter = self._status_counter = 0
-        self._last_command = -1
+        self._last_command = self._last_load = -1
         self._last_ns = 0
         self._started = False
         self.ignored: Counter[str] = Counter()
@@ -92,7 +94,7 @@ class Node:
                 next_beat = now + HEARTBEAT_NS
                 self._send(self._heartbeat_id, b"\x05")
             if self._pacing == "cyclic" and now >= next_cycle:
-                next_cycle += self._period_ns * max(1, (now - next_cycle) // self._period_ns)
+                next_cycle += self._period_ns * (1 + (now - next_cycle) // self._period_ns)
                 self.sync(now)
             wake = min(next_beat, next_cycle) if self._pacing == "cyclic" else next_beat
             self._serve(min(max(wake - now, 0), IDLE_NS))
@@ -105,11 +107,15 @@ class Node:
             frame = None
         if frame is not None:
             self.take(frame)
-        elif self._clock == "realtime" and self._started:
+        if frame is None or time.monotonic_ns() - self._last_ns > IDLE_NS:  # a flood must not stop the plant
+            self._catch_up()
+
+    def _catch_up(self) -> None:
+        """Realtime: let the plant catch up with the clock, once its time has begun."""
+        if self._clock == "realtime" and self._started:
             self._advance_to(time.monotonic_ns())
 
     def _advance_to(self, now_ns: int) -> None:
-        """Realtime: let the plant catch up with the clock."""
         advance(self._params[0], self.state, now_ns - self._last_ns)
         self._last_ns = now_ns
 
@@ -120,7 +126,10 @@ class Node:
         elif frame.can_id == self._command.can_id:
             self._on_command(frame.data)
         elif frame.can_id == self._sync_id and self._pacing == "sync":
-            self.sync(time.monotonic_ns())
+            if len(frame.data) > 1:  # CANopen: no data or the counter
+                self.ignored["length"] += 1
+            else:
+                self.sync(time.monotonic_ns())
         elif self._load and frame.can_id == self._load.can_id:
             self._on_load(frame.data)
 
@@ -137,12 +146,14 @@ class Node:
         if not self._acceptable(self._command, data):
             return
         counter, controlword, u_q, u_d = self._read_command(data)
+        if self._read_mode(data)[0] != VOLTAGE_MODE:
+            self.ignored["mode"] += 1
+            return
         if counter == self._last_command:
             self.ignored["repeated"] += 1
             return
         self._last_command = int(counter)
-        if self._clock == "realtime" and self._started:
-            self._advance_to(time.monotonic_ns())
+        self._catch_up()
         if self._read_inline:
             enable, T_L = self._read_inline(data)
             on_load_command(self.state, T_L if enable else 0.0)
@@ -150,9 +161,14 @@ class Node:
 
     def _on_load(self, data: bytes) -> None:
         assert self._load is not None and self._read_load is not None  # noqa: S101 - set together
-        if self._acceptable(self._load, data):
-            _, enable, T_L = self._read_load(data)
-            on_load_command(self.state, T_L if enable else 0.0)
+        if not self._acceptable(self._load, data):
+            return
+        counter, enable, T_L = self._read_load(data)
+        if counter == self._last_load:
+            self.ignored["repeated"] += 1
+            return
+        self._last_load = int(counter)
+        on_load_command(self.state, T_L if enable else 0.0)
 
     def sync(self, now_ns: int) -> None:
         """One SYNC (or cycle): advance, latch, sample, answer."""

@@ -39,8 +39,18 @@ def normal(s: Any) -> float:
 
 @jit
 def to_wire(value: float, lsb: float, top: float) -> float:
-    """Round to the wire's resolution and saturate at +-top; + 0.0 since the wire has no negative zero."""
-    return float(min(max(np.rint(value / lsb) * lsb, -top), top) + 0.0)
+    """Round to the wire's resolution and saturate at +-top; + 0.0 since the wire has no negative zero.
+
+    It is the raw number that saturates: raw * lsb is then what a receiver decodes, to the bit.
+    """
+    raw_top = np.rint(top / lsb)
+    return float(min(max(np.rint(value / lsb), -raw_top), raw_top) * lsb + 0.0)
+
+
+@jit
+def whole_degrees(temperature: float) -> float:
+    """Temperature on the wire: whole degrees from -40 to 215 degC."""
+    return float(min(max(np.rint(temperature), -40.0), 215.0) + 0.0)
 
 
 @jit
