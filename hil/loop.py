@@ -50,6 +50,12 @@ class Outcome:
     state: int = 0
 
 
+def transition_event(state: int, reason: int) -> tuple[str, str]:
+    """Kind and text of the event that a change of the supervisor's state is logged as."""
+    name = DriveState(state).name
+    return ("stop", f"{name}: {Reason(reason).name}") if reason else ("state", name)
+
+
 class Loop:
     """A closed loop over a drive port. :meth:`run` returns after a safe stop, whatever happened."""
 
@@ -68,6 +74,7 @@ class Loop:
         self._prepare, self._step = prepare, step
         self._ticks, self._plan, self._request = ticks, plan, request
         self._outcome = Outcome()
+        self._state = int(DriveState.SWITCH_ON_DISABLED)
 
     def run(self) -> Outcome:
         """Run until the supervisor has ended the run. The drive is stopped on every way out."""
@@ -115,6 +122,9 @@ class Loop:
         if tick["send"]:
             self._send(tick)
         tick["sent_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
+        if tick["state"] != self._state:
+            self._state = int(tick["state"])
+            self._recorder.event(deadline_ns, k, *transition_event(self._state, int(tick["reason"])))
         self._recorder.tick(self._ticks)
         tick["recorded_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
 

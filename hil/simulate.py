@@ -25,6 +25,7 @@ from hil.errors import ConfigError
 from hil.kernel import prepare, step
 from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
+from hil.loop import transition_event
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 
 Record = npt.NDArray[np.void]
@@ -155,7 +156,12 @@ def simulate(setup: Setup, plant_settings: list[str]) -> dict[str, Any]:
     start = time.perf_counter()
     file = RunFile(path, header_of(setup, "simulate", "lockstep"))
     last, count = new_ticks()[0], 0
+    state = int(DriveState.SWITCH_ON_DISABLED)
     for ticks in simulation.blocks():
+        for row in np.nonzero(np.diff(ticks["state"].astype(np.int64), prepend=state))[0]:
+            t = ticks[row]
+            file.add_event(int(t["t_ns"]), int(t["k"]), *transition_event(int(t["state"]), int(t["reason"])))
+        state = int(ticks["state"][-1])
         file.add_ticks(ticks)
         last, count = ticks[-1].copy(), count + len(ticks)
     reason = Reason(int(last["reason"])).name.lower()

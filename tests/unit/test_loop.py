@@ -149,7 +149,7 @@ def test_a_sync_that_fails_is_a_bus_that_is_down() -> None:
 def test_a_command_that_fails_is_logged_and_marked() -> None:
     loop, memory, _ = make(ScriptedDrive({"send": 2}), FakeClock(), ticks=4)
     loop.run()
-    assert memory.events == ["send-failed"]
+    assert memory.events == ["state", "send-failed", "stop"]
     assert [int(t["send"][0]) for t in memory.ticks][:4] == [1, 0, 1, 1]
 
 

@@ -1,0 +1,178 @@
+"""Runs inside the bench machine (or on any host with vcan): real hil processes on real SocketCAN interfaces.
+
+Each scenario leaves what it saw in $OUT/NAME/: the run's JSON, its log, what candump saw. Judging is left to
+the tests on the host side, so that one boot serves them all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+OUT = Path(os.environ["OUT"])
+SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
+CONFIG = "configs/vcan0.toml"
+
+
+def sh(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+def hil(*words: str, **options: object) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-m", "hil.cli", *words], text=True, **options)  # type: ignore[call-overload]
+
+
+class Scenario:
+    """Emulator on one interface, controller on another (or the same), candump watching."""
+
+    def __init__(
+        self, name: str, drive: str = "vcan0", controller: str = "vcan0", seconds: float = 2.0
+    ) -> None:
+        self.name, self.drive, self.controller, self.seconds = name, drive, controller, seconds
+        self.folder = SCRATCH / name
+        self.folder.mkdir()
+        self.dump = self.folder / "candump.log"
+
+    def __enter__(self) -> Scenario:
+        self._candump = subprocess.Popen(["candump", "-L", self.controller], stdout=self.dump.open("w"))
+        self.emulator = hil("emulate", CONFIG, "-c", self.drive, stdout=subprocess.PIPE)
+        assert self.emulator.stdout is not None
+        self.ready = self.emulator.stdout.readline()
+        return self
+
+    def start(self, *more: str) -> subprocess.Popen[str]:
+        folder = ["--set", f'log.folder="{self.folder}"', "--set", f"loop.duration_s={self.seconds}"]
+        arm = [] if self.controller.startswith("vcan") else ["--arm", "--yes"]
+        self.run = hil(
+            "run", CONFIG, "-c", self.controller, "--json", *arm, *folder, *more, stdout=subprocess.PIPE
+        )
+        return self.run
+
+    def running(self) -> None:
+        """Wait until commands are on the bus and the drive has been in operation for a while."""
+        for _ in range(6000):
+            if self.dump.read_text().count(" 201#") > 300 or self.run.poll() is not None:
+                return
+            time.sleep(0.01)
+
+    def __exit__(self, *_: object) -> None:
+        out, _err = self.run.communicate(timeout=120)
+        self.emulator.terminate()
+        tail, _err = self.emulator.communicate(timeout=60)
+        self._candump.terminate()
+        self._candump.wait()
+        result = {
+            "returncode": self.run.returncode,
+            "run": json.loads(out or "{}"),
+            "emulator": self.ready + tail,
+        }
+        (self.folder / "result.json").write_text(json.dumps(result))
+        shutil.copytree(self.folder, OUT / self.name)
+
+
+def vcan_two_processes() -> None:
+    with Scenario("vcan_two_processes") as s:
+        s.start()
+
+
+def kvaser_pair() -> None:
+    if not Path("/sys/class/net/can1").exists():
+        return
+    (OUT / "kvaser-link.json").write_text(
+        sh("ip", "-json", "-details", "-statistics", "link", "show", "can0")
+    )
+    with Scenario("kvaser_pair", drive="can1", controller="can0") as s:
+        s.start()
+
+
+def interface_goes_down_and_up() -> None:
+    with Scenario("interface_goes_down_and_up", seconds=30.0) as s:
+        s.start()
+        s.running()
+        sh("ip", "link", "set", "vcan0", "down")
+        time.sleep(0.3)
+        sh("ip", "link", "set", "vcan0", "up")
+        after = subprocess.Popen(["candump", "-L", "vcan0"], stdout=(s.folder / "after.log").open("w"))
+        s.run.wait(60)
+        time.sleep(0.5)
+        after.terminate()
+
+
+def drive_dies() -> None:
+    with Scenario("drive_dies", seconds=30.0) as s:
+        s.start()
+        s.running()
+        s.emulator.send_signal(signal.SIGKILL)
+
+
+def second_master() -> None:
+    with Scenario("second_master", seconds=30.0) as s:
+        s.start()
+        s.running()
+        sh("cansend", "vcan0", "201#0102030405060708")
+
+
+def injected_and_ridden_through() -> None:
+    with Scenario("injected_and_ridden_through", seconds=6.0) as s:
+        s.start()
+        s.running()
+        for frame in ("181#0011223344556677", "181#00", "555#DEADBEEF", "1ABCDEF0#00", "181#R"):
+            sh("cansend", "vcan0", frame)
+            time.sleep(0.05)
+        sh("cangen", "vcan0", "-I", "444", "-L", "8", "-g", "0", "-n", "300")
+
+
+def injected_beyond_the_budget() -> None:
+    with Scenario("injected_beyond_the_budget", seconds=30.0) as s:
+        s.start()
+        s.running()
+        sh("cangen", "vcan0", "-I", "181", "-L", "8", "-D", "0011223344556677", "-g", "1", "-n", "60")
+
+
+def no_partner_fills_the_queue() -> None:
+    if not Path("/sys/class/net/can1").exists():
+        return
+    with Scenario("no_partner_fills_the_queue", drive="can1", controller="can0", seconds=30.0) as s:
+        s.start()
+        s.running()
+        sh("ip", "link", "set", "can1", "down")
+        s.run.wait(60)
+        (s.folder / "link.json").write_text(
+            sh("ip", "-json", "-details", "-statistics", "link", "show", "can0")
+        )
+        sh("ip", "link", "set", "can1", "up")
+
+
+def main() -> int:
+    scenarios: list[Callable[[], None]] = [
+        vcan_two_processes,
+        kvaser_pair,
+        interface_goes_down_and_up,
+        drive_dies,
+        second_master,
+        injected_and_ridden_through,
+        injected_beyond_the_budget,
+        no_partner_fills_the_queue,
+    ]
+    wanted = sys.argv[1:]
+    for scenario in scenarios:
+        if wanted and scenario.__name__ not in wanted:
+            continue
+        begin = time.monotonic()
+        try:
+            scenario()
+        except Exception as error:
+            print(f"{scenario.__name__}: {type(error).__name__}: {error}", flush=True)
+        print(f"{scenario.__name__}: {time.monotonic() - begin:.1f} s", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,148 @@
+"""What real SocketCAN interfaces saw: judged on the host from what the scenarios left."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.codec import Database
+from hil.log.reader import Log, open_log
+from hil.replay import replay_log
+from hil.signals import DriveState, RxFlag
+from tests.conftest import CONFIGS
+
+pytestmark = [pytest.mark.vm, pytest.mark.timeout(1800)]
+HOUSE = Database(CONFIGS / "drives" / "hil_pmsm.dbc")
+BY_ID = {message.can_id: message for message in HOUSE.messages.values()}
+
+
+@dataclass
+class Seen:
+    """One scenario: the run's result, its log, the frames that candump saw (id, data)."""
+
+    result: dict[str, Any]
+    log: Log
+    frames: list[tuple[int, bytes]]
+    folder: Path
+
+
+def frames_of(path: Path) -> list[tuple[int, bytes]]:
+    rows = []
+    for line in path.read_text().splitlines():
+        head, _, data = line.split()[2].partition("#")
+        if len(head) == 3 and not data.startswith("R"):
+            rows.append((int(head, 16), bytes.fromhex(data)))
+    return rows
+
+
+def seen(socketcan: Path, name: str) -> Seen:
+    folder = socketcan / name
+    if not folder.is_dir():
+        pytest.fail(f"scenario {name} left nothing:\n{(socketcan / 'printed').read_text()}")
+    log = open_log(next(folder.glob("*.mcap")))
+    return Seen(
+        json.loads((folder / "result.json").read_text()), log, frames_of(folder / "candump.log"), folder
+    )
+
+
+def voltage_of(data: bytes) -> float:
+    values = HOUSE.message("COMMAND").decode(data)
+    return abs(values["VoltageQ"]) + abs(values["VoltageD"])
+
+
+def assert_nothing_after_the_stop(run: Seen) -> None:
+    """From the first tick with a reason on: only zero voltage, in the log and on the wire."""
+    ticks = run.log.ticks
+    stopped = ticks[ticks["reason"] != 0]
+    assert len(stopped) > 0
+    assert (np.abs(stopped["u_q"]) + np.abs(stopped["u_d"]) == 0).all()
+    commands = [data for can_id, data in run.frames if can_id == 0x201 and len(data) == 8]
+    valid = [data for data in commands if HOUSE.message("COMMAND").valid(data)]
+    driving = [k for k, data in enumerate(valid) if voltage_of(data) > 0]
+    if driving:
+        assert all(voltage_of(data) == 0 for data in valid[driving[-1] + 1 :])
+
+
+@pytest.mark.parametrize("name", ["vcan_two_processes", "kvaser_pair"])
+def test_a_run_between_two_processes(socketcan: Path, name: str) -> None:
+    run = seen(socketcan, name)
+    assert run.result["returncode"] == 0, run.result
+    assert run.result["run"]["skipped"] == 0 and run.result["run"]["dropped"] == 0
+    assert run.result["run"]["ticks"] >= 2000
+    assert replay_log(run.log).verdict == "same"
+    late_us = run.log.ticks["lateness_ns"] * 1e-3
+    print(f"{name}: lateness p50 {np.median(late_us):.0f} us, max {late_us.max():.0f} us in virtual time")
+
+
+@pytest.mark.parametrize("name", ["vcan_two_processes", "kvaser_pair"])
+def test_candump_sees_exactly_the_frames_that_the_dbc_says(socketcan: Path, name: str) -> None:
+    run = seen(socketcan, name)
+    assert {can_id for can_id, _ in run.frames} <= set(BY_ID)
+    for can_id, data in run.frames:
+        message = BY_ID[can_id]
+        assert len(data) == message.length, message.name
+        assert message.valid(data), message.name
+    counts = {name: sum(can_id == m.can_id for can_id, _ in run.frames) for name, m in HOUSE.messages.items()}
+    ticks = run.result["run"]["ticks"]
+    for message in ("SYNC", "FEEDBACK", "COMMAND"):
+        assert abs(counts[message] - ticks) <= 10, counts
+    logged = {0x80: 0, 0x181: 0, 0x201: 0}
+    for frame in run.log.frames:
+        if frame.can_id in logged:
+            logged[frame.can_id] += 1
+    assert abs(logged[0x181] - counts["FEEDBACK"]) <= 10 and abs(logged[0x201] - counts["COMMAND"]) <= 10
+
+
+def test_the_kernel_tells_the_truth_about_the_card(socketcan: Path) -> None:
+    link = json.loads((socketcan / "kvaser-link.json").read_text())[0]
+    data = link["linkinfo"]["info_data"]
+    assert data["bittiming"]["bitrate"] == 1_000_000 and data["restart_ms"] == 0
+    assert data["state"] == "ERROR-ACTIVE" and link["txqlen"] == 10
+
+
+def test_a_bus_outage_ends_the_run_and_nothing_stale_is_sent(socketcan: Path) -> None:
+    run = seen(socketcan, "interface_goes_down_and_up")
+    assert run.result["returncode"] == 1 and run.result["run"]["ended"] == "bus_down"
+    assert_nothing_after_the_stop(run)
+    after = [can_id for can_id, _ in frames_of(run.folder / "after.log")]
+    assert 0x201 not in after and 0x080 not in after
+    assert (run.log.ticks["rx_flags"] & int(RxFlag.BUS_DOWN)).any()
+    assert any(event["kind"] == "stop" and "BUS_DOWN" in event["text"] for event in run.log.events)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("drive_dies", "stale_feedback"),
+        ("second_master", "foreign_command"),
+        ("injected_beyond_the_budget", "crc_errors"),
+    ],
+)
+def test_each_fault_stops_with_its_reason(socketcan: Path, name: str, reason: str) -> None:
+    run = seen(socketcan, name)
+    assert run.result["returncode"] == 1 and run.result["run"]["ended"] == reason
+    assert run.log.ticks["state"][-1] in (DriveState.FAULT, DriveState.SWITCH_ON_DISABLED)
+    assert any(event["kind"] == "stop" and reason.upper() in event["text"] for event in run.log.events)
+    assert_nothing_after_the_stop(run)
+
+
+def test_a_few_bad_frames_and_a_flood_are_ridden_through(socketcan: Path) -> None:
+    run = seen(socketcan, "injected_and_ridden_through")
+    assert run.result["returncode"] == 0 and run.result["run"]["ended"] == "stop_requested"
+    flags = np.bitwise_or.reduce(run.log.ticks["rx_flags"])
+    assert flags & RxFlag.CRC_ERROR and flags & RxFlag.LENGTH_ERROR
+    assert replay_log(run.log).verdict == "same"
+
+
+def test_a_bus_without_a_partner_ends_the_run(socketcan: Path) -> None:
+    run = seen(socketcan, "no_partner_fills_the_queue")
+    assert run.result["returncode"] == 1
+    assert run.result["run"]["ended"] in ("stale_feedback", "send_failed")
+    assert_nothing_after_the_stop(run)
+    link = json.loads((run.folder / "link.json").read_text())[0]
+    assert link["linkinfo"]["info_data"]["state"] != "ERROR-ACTIVE"
