@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag, expm
 
-from hil.paper.examples import Array, Case, Example, basis, basis_rate
+from hil.control.linalg import Array
+from hil.paper.examples import Case, Example, basis, basis_rate
 
 
 def theta(gamma: Array, D: float) -> Array:
@@ -31,7 +32,7 @@ def channel_theta(gamma: Array, D: float) -> Array:
 
 
 def window(gamma: Array, D: float, s: Array) -> Array:
-    """w(s) = sum_i Theta_i gamma_i e^{-gamma_i s}: d_hat is the average of d over the past D with it; (k, n)."""
+    """w(s) = sum_i Theta_i gamma_i e^{-gamma_i s}, with which d_hat averages d over the past D; (k, n)."""
     weights, rows = channel_theta(gamma, D), np.asarray(s)[:, None]
     values: Array = sum(weights[i] * gamma[i] * np.exp(-gamma[i] * rows) for i in range(2))
     return values

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from hil.control.composite import continuous_gain
 from hil.control.law import MotorModel
-
-Array = npt.NDArray[np.float64]
+from hil.control.linalg import Array
 
 RECONSTRUCTION: Final = MotorModel(R_s=2.875, L_d=0.033, L_q=0.033, psi_f=0.8, n_p=3, J=0.011, B_f=2e-4)
 """The round motor that satisfies the four identities of the printed Pi; the same as motors/reconstruction."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Final
 
 import numpy as np
 from scipy.linalg import expm
@@ -16,13 +15,10 @@ from scipy.linalg import expm
 from hil.control.composite import composite_command, composite_gain
 from hil.control.fac import SampledModel, sample
 from hil.control.jit import jit
-from hil.control.linalg import matvec, matvec_add
+from hil.control.linalg import Array, Index, matvec, matvec_add
 from hil.control.observer import Window, ftdob, window_step
 from hil.paper.continuous import Trace, initial_h, theta
-from hil.paper.examples import Array, Case, Example, basis, basis_rate
-
-EXACT: Final = 0
-EULER: Final = 1
+from hil.paper.examples import Case, Example, basis, basis_rate
 
 
 @jit
@@ -30,7 +26,7 @@ def run_loop(
     plant: tuple[Array, Array, Array],
     model: tuple[Array, Array, Array],
     gains: tuple[Array, Array],
-    window: tuple[Array, Array, Array, Array],
+    window: tuple[Array, Array, Array, Index],
     memory: tuple[Array, Array],
     xs: Array,
     us: Array,
@@ -105,7 +101,7 @@ def _memory(h: Array, window: Window) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """max over channels of abs(error) / abs(initial error) against t (k,), for each initial error; (errors, k)."""
+    """Largest error of a channel over t (k,), for each initial error (e,); shape of the curves (e, k)."""
 
     t: Array
     initial: Array
@@ -127,11 +123,11 @@ def convergence(e: Example, T_s: float = 0.01, ticks: int = 100) -> Convergence:
     xs = np.zeros((ticks + 1, e.n))
     for k in range(ticks):
         xs[k + 1] = model.Ad @ xs[k] + model.Ed @ d
-    curves = [
+    exact, euler, dob = (
         np.array([np.abs(run(e, model, xs, d + error) - d).max(axis=1) for error in initial])
         for run in (_ftdob_estimates, _euler_estimates, _dob_estimates)
-    ]
-    return Convergence(np.arange(ticks + 1) * T_s, initial, *curves, N=round(e.D / T_s))
+    )
+    return Convergence(np.arange(ticks + 1) * T_s, initial, exact, euler, dob, round(e.D / T_s))
 
 
 def _innovations(model: SampledModel, xs: Array) -> Array:
