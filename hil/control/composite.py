@@ -26,6 +26,8 @@ class CompositeGain:
 def _check(B: Array, Upsilon: Array, Z: Array) -> tuple[Array, Array, Array]:
     """Conditions of Theorem 2: B square and invertible, Upsilon Hurwitz, det(Z) != 0."""
     B, Upsilon, Z = (np.array(m, float) for m in (B, Upsilon, Z))
+    if not all(np.isfinite(m).all() for m in (B, Upsilon, Z)):
+        raise ControlDesignError("B, Upsilon and Z must be finite; is a pole or a motor parameter missing?")
     if B.ndim != 2 or B.shape[0] != B.shape[1] or np.linalg.cond(B) > SINGULAR:
         raise ControlDesignError(f"B must be square and invertible (full actuation), not {B.tolist()}")
     if Upsilon.shape != B.shape or Z.shape != B.shape:

@@ -54,7 +54,8 @@ LAW_PARAMS: Final = np.dtype(
         ("a_w", "f8"),
         ("e_w", "f8"),
         ("lam_w", "f8"),
-        ("lam_i", "f8"),
+        ("lam_q", "f8"),
+        ("lam_d", "f8"),
         ("i_max", "f8"),
         ("T_L_max", "f8"),
     ],
@@ -166,8 +167,19 @@ def law_window(spec: LawSpec, T_s: float) -> Window:
     return window
 
 
+def _check(spec: LawSpec) -> None:
+    """Refuse a motor or limits that no law can be designed for."""
+    m = spec.motor
+    positive = {"R_s": m.R_s, "L_d": m.L_d, "L_q": m.L_q, "psi_f": m.psi_f, "n_p": m.n_p, "J": m.J}
+    wrong = [name for name, value in (positive | {"i_max": spec.i_max}).items() if not value > 0]
+    wrong += [name for name, value in {"B_f": m.B_f, "T_L_max": spec.T_L_max}.items() if not value >= 0]
+    if wrong:
+        raise ControlDesignError(f"{', '.join(wrong)} must be positive (B_f and T_L_max may be 0)")
+
+
 def design_law(spec: LawSpec, T_s: float) -> Record:
     """Design a law: a one-element array of LAW_PARAMS. Raises ControlDesignError."""
+    _check(spec)
     motor = spec.motor
     model, window = sampled_model(motor, T_s), law_window(spec, T_s)
     poles = (spec.speed_pole, spec.current_pole, spec.current_d_pole)
@@ -196,7 +208,8 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "a_w": speed.Ad[0, 0],
         "e_w": speed.Ed[0, 0],
         "lam_w": math.exp(-spec.speed_pole * T_s),
-        "lam_i": math.exp(-spec.current_pole * T_s),
+        "lam_q": math.exp(-spec.current_pole * T_s),
+        "lam_d": math.exp(-spec.current_d_pole * T_s),
         "i_max": spec.i_max,
         "T_L_max": spec.T_L_max,
     }
@@ -264,13 +277,14 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     """Advance the observer by the past ``periods`` ticks, in which s['ua'] was applied.
 
     Without a fresh measurement only the gap grows; the next one then makes up for all of it exactly. The
-    memory starts filled with the first innovation (bumpless). A gap over max_gap ticks starts anew.
+    memory starts filled with the first innovation (bumpless). A gap over max_gap ticks starts anew, and so
+    does a count below 1: there is no such period, and no gap inverse that could be read for it.
     """
     if s["started"]:
         for _ in range(min(periods, p["max_gap"] + 1)):
             open_loop(p, s)
         s["gap"] += periods
-        if s["gap"] > p["max_gap"]:
+        if periods < 1 or s["gap"] > p["max_gap"]:
             reset(s)
     if not fresh:
         return
@@ -328,10 +342,10 @@ def free_response(p: Any, s: Any) -> None:
 
 @jit
 def current_law(p: Any, s: Any) -> None:
-    """u_q, u_d that move both current errors by e^{-p_i T_s} a tick; i_d* = 0."""
+    """u_q, u_d that move the current errors by e^{-p_q T_s} and e^{-p_d T_s} a tick; i_d* = 0."""
     free_response(p, s)
-    q_wanted = s["i_q_ref"] + p["lam_i"] * (s["x_p"][1] - s["i_q_ref"])
-    d_wanted = p["lam_i"] * s["x_p"][2]
+    q_wanted = s["i_q_ref"] + p["lam_q"] * (s["x_p"][1] - s["i_q_ref"])
+    d_wanted = p["lam_d"] * s["x_p"][2]
     s["u"][0] = 0.0
     s["u"][1] = (q_wanted - s["work"][1]) / p["Bd"][1, 1]
     s["u"][2] = (d_wanted - s["work"][2]) / p["Bd"][2, 2]
@@ -339,8 +353,12 @@ def current_law(p: Any, s: Any) -> None:
 
 @jit
 def fac_law(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float) -> None:
-    """u = Bd^-1 (x* + Z e^{Upsilon T_s} Z^-1 (x_p - x*) - Ad x_p - Ed d_p), x* = (w*, i_q*, 0)."""
+    """u = Bd^-1 (x* + Z e^{Upsilon T_s} Z^-1 (x_p - x*) - Ad x_p - Ed d_p), x* = (w*, i_q*, 0).
+
+    i_q* is limited to i_max, T_L to T_L_max.
+    """
     free_response(p, s)
+    i_q_ref = min(max(i_q_ref, -p["i_max"]), p["i_max"])
     s["i_q_ref"] = i_q_ref
     target = w_ref + p["T_s"] * dw_ref
     e_w, e_q, e_d = s["x_p"][0] - target, s["x_p"][1] - i_q_ref, s["x_p"][2]

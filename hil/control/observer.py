@@ -61,7 +61,10 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
         raise ControlDesignError(
             f"Gamma must be a positive diagonal matrix (Theorem 1, 1), not {gamma.ravel()}"
         )
-    if (delay < T_s * 0.999999).any() or not np.isfinite(delay).all():
+    _check_tick(T_s)
+    if not np.isfinite(delay).all():
+        raise ControlDesignError(f"D must be finite (Theorem 1), not {delay}")
+    if (delay < T_s * 0.999999).any():
         raise ControlDesignError(f"D = {delay.min()} s is shorter than a tick, T_s = {T_s} s; lengthen D")
     if (gamma[0] == gamma[1]).any():
         channel = int(np.argmax(gamma[0] == gamma[1]))
@@ -84,11 +87,18 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
     return Window(lam, lam_N, np.array([lam_N[1] / determinant, -lam_N[0] / determinant]), N)
 
 
+def _check_tick(T_s: float) -> None:
+    """Refuse a sample time [s] that is none."""
+    if not 0 < T_s < np.inf:
+        raise ControlDesignError(f"T_s must be positive and finite, not {T_s}")
+
+
 def conventional_dob(gamma_c: Array, T_s: float) -> Window:
     """Conventional DOB (31): d_hat = h, h_k = lam h_{k-1} + (1 - lam) v_k; gamma_c [rad/s] (n,)."""
     gamma = np.atleast_1d(np.asarray(gamma_c, float))
     if not (np.isfinite(gamma).all() and (gamma > 0).all()):
         raise ControlDesignError(f"Gamma_c must be positive, not {gamma}")
+    _check_tick(T_s)
     lam = np.exp(-gamma * T_s)
     zero = np.zeros_like(lam)
     return Window(

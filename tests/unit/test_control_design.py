@@ -56,7 +56,7 @@ def test_printed_pi_of_section_5() -> None:
         (2.0, 2.0 + 1e-12, 0.1, "singular"),
         (1e5, 2e5, 0.1, "singular"),
         (1.0, 2.0, 0.9e-3, "shorter than a tick"),
-        (1.0, 2.0, math.inf, "shorter than a tick"),
+        (1.0, 2.0, math.inf, "D must be finite"),
     ],
 )
 def test_conditions_of_theorem_1(gamma_1: float, gamma_2: float, delay: float, condition: str) -> None:
