@@ -64,9 +64,11 @@ def slopes(m: MotorModel, x: np.ndarray, T_L: float, u: np.ndarray) -> np.ndarra
     )
 
 
-def motor_period(m: MotorModel, x: np.ndarray, T_L: float, u: np.ndarray, substeps: int = 4) -> np.ndarray:
+def motor_period(
+    m: MotorModel, x: np.ndarray, T_L: float, u: np.ndarray, substeps: int = 4, T_s: float = T_S
+) -> np.ndarray:
     """One tick of RK4."""
-    h = T_S / substeps
+    h = T_s / substeps
     for _ in range(substeps):
         k1 = slopes(m, x, T_L, u)
         k2 = slopes(m, x + h / 2 * k1, T_L, u)
@@ -242,6 +244,45 @@ def test_start_is_bumpless_and_counts_what_fills() -> None:
     assert trace.filled[-1] == N_W
     assert np.abs(trace.x[:, 0] - 80.0).max() < 0.05
     assert np.abs(trace.i_q_ref).max() < 0.5
+
+
+def test_the_first_innovation_is_the_estimate() -> None:
+    """The memory starts filled, so a d that stands since before the start is known after one period."""
+    p, s = design_law(spec(coupling=False), T_S)[0], new_law_state()[0]
+    model, d, x = sampled_model(MOTOR, T_S), np.array([-400.0, 30.0, -20.0]), np.array([10.0, 1.0, 0.5])
+    observe(p, s, x[0], x[1], x[2], True, 1)
+    x = model.Ad @ x + model.Ed @ d
+    observe(p, s, x[0], x[1], x[2], True, 1)
+    np.testing.assert_allclose(s["d_hat"], d, rtol=1e-9)
+
+
+def residual(T_s: float) -> np.ndarray:
+    """v of one period of the full motor without voltage or anything unknown, currents changing fast."""
+    p, s = design_law(spec(motor=SALIENT), T_s)[0], new_law_state()[0]
+    x = np.array([80.0, 6.0, -4.0])
+    observe(p, s, x[0], x[1], x[2], True, 1)
+    x = motor_period(SALIENT, x, 0.0, np.zeros(2), substeps=20, T_s=T_s)
+    observe(p, s, x[0], x[1], x[2], True, 1)
+    return np.array(s["v"])
+
+
+def test_known_terms_are_second_order_exact() -> None:
+    """A quarter of the period leaves a sixteenth of the residual."""
+    np.testing.assert_allclose(residual(1e-4) / residual(2.5e-5), 16.0, rtol=0.2)
+
+
+def test_fac_follows_a_ramp() -> None:
+    """The known derivative of w* leaves no error on a ramp in the linear model."""
+    p, s = design_law(spec("fac", coupling=False), T_S)[0], new_law_state()[0]
+    model, x, late = sampled_model(MOTOR, T_S), np.zeros(3), np.zeros(3)
+    for k in range(500):
+        observe(p, s, x[0], x[1], x[2], True, 1)
+        ua = late
+        apply(s, ua[0], ua[1], ua[2])
+        command(p, s, 50.0 * k * T_S, 50.0, 1.5, U_LIMIT)
+        late = s["u"].copy()
+        before, x = x, model.Ad @ x + model.Bd @ ua
+    assert before[0] == pytest.approx(50.0 * 499 * T_S, abs=1e-4)
 
 
 def test_a_gap_that_is_too_long_starts_anew() -> None:
