@@ -1,0 +1,43 @@
+"""Worst-case load of a CAN bus from the messages on it: bits of a frame with all stuff bits, times its rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+
+
+def classic_bits(length: int, extended: bool = False) -> int:
+    """Longest classic frame of ``length`` data bytes, with the interframe space [bit].
+
+    C = g + 8 s + 13 + floor((g + 8 s - 1) / 4), g = 34 (11-bit identifier) or 54 (29-bit): Davis, Burns,
+    Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and revised",
+    Real-Time Systems 35 (2007), section 2.
+    """
+    exposed = (54 if extended else 34) + 8 * length
+    return exposed + 13 + (exposed - 1) // 4
+
+
+def fd_bits(length: int, extended: bool = False) -> tuple[int, int]:
+    """Longest CAN FD frame of up to ``length`` bytes: (bits at the nominal, bits at the data bitrate).
+
+    Nominal 32 (11-bit identifier) or 49 (29-bit), data 28 + 5 ceil((s - 16) / 64) + 10 s: Bordoloi, Samii,
+    "The frame packing problem for CAN-FD", IEEE RTSS 2014.
+    """
+    s = next(size for size in FD_LENGTHS if size >= length)
+    return (49 if extended else 32), 28 + 5 * max(0, -(-(s - 16) // 64)) + 10 * s
+
+
+def frame_seconds(
+    length: int, *, fd: bool, extended: bool, bitrate: int, data_bitrate: int | None = None
+) -> float:
+    """Longest time that one frame occupies the bus [s]."""
+    if not fd:
+        return classic_bits(length, extended) / bitrate
+    nominal, data = fd_bits(length, extended)
+    return nominal / bitrate + data / (data_bitrate or bitrate)
+
+
+def bus_load(frames: Iterable[tuple[float, float]]) -> float:
+    """Share of the bus's time that (seconds per frame, frames per second) take together, 0 .. 1 and over."""
+    return sum(seconds * rate for seconds, rate in frames)
