@@ -5,6 +5,7 @@ The frames' CRCs are computed here, bit by bit from AUTOSAR's definition, not by
 
 from __future__ import annotations
 
+import itertools
 import struct
 import time
 from collections import deque
@@ -269,10 +270,18 @@ def test_a_flood_does_not_keep_the_watchdog_from_tripping(configs: Path) -> None
 def test_a_cyclic_drive_keeps_its_own_time(configs: Path) -> None:
     bench = Bench(configs, clock="realtime", pacing="cyclic")
     bench.node.warm_up()
+
+    def stalls() -> Any:
+        """The process stands still for 200 ms, then there is time enough to catch up in a burst."""
+        for pause in itertools.chain([0.2], itertools.repeat(1e-4)):
+            time.sleep(pause)
+            yield None
+
+    bench.link.flood = stalls()
     end = time.monotonic() + 0.5
     bench.node.run(lambda: time.monotonic() > end)
     count = bench.ids().count(0x181)
-    assert 50 < count <= 502, count  # skipped cycles are skipped, not sent in a burst
+    assert 30 < count <= 305, count  # skipped cycles are skipped, never sent in a burst
     assert bench.node.state["t_ns"] > 300_000_000
 
 
@@ -312,6 +321,6 @@ def test_the_papers_plant_reaches_its_operating_point(configs: Path) -> None:
         bench.link.sent.clear()
         bench.put(0x80, b"")
     assert state["state"] == ENABLED and state["limited"] == 0
-    np.testing.assert_allclose(state["x"], [500.0, 1.5, 0.0], atol=0.05)
+    assert (np.abs(state["x"] - [500.0, 1.5, 0.0]) < [0.2, 0.01, 0.01]).all(), state["x"]
     assert bench.ids() == [0x481, 0x181] and len(bench.link.sent[-1][1]) == 64
     assert (config.disturbance.phi_w_rad_s2, config.disturbance.phi_q_a_s) == (0.1, 0.2)
