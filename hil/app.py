@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import platform
 import signal
 import subprocess
@@ -27,6 +28,7 @@ from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, HilError
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.progress import say, watching
 from hil.signals import Reason, new_ticks
 
 EMULATED_INTERFACES = ("hil-local", "virtual")
@@ -242,7 +244,9 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
     try:
         with opened_client(setup, recorder, clock) as client:
+            say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             _await_drive(setup, client)
+            say(f"arming; log {path}")
             result = _run_armed(setup, client, recorder, clock, request)
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
@@ -288,7 +292,8 @@ def _run_armed(
             client.discard()
             if clock.name == "monotonic":
                 grants = realtime.acquire(setup.config.realtime)
-            outcome = loop.run()
+            with watching(os.getpid(), plan.ticks):
+                outcome = loop.run()
     except BaseException as error:
         failure = f"{type(error).__name__}: {error}"
         raise

@@ -209,3 +209,8 @@ def new_ticks(count: int = 1) -> TickArray:
     for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
         ticks[name] = np.nan
     return ticks
+
+
+def ticks_from(raw: bytes) -> TickArray:
+    """Tick records from their bytes."""
+    return np.frombuffer(raw, TICK)
