@@ -92,6 +92,7 @@ class LoopTable(Table):
     duration_s: Positive | None = None
     feedback_timeout_us: Annotated[int, Field(ge=10)] | None = None
     max_gap_ticks: Annotated[int, Field(ge=1, le=64)] = 20
+    shadow: bool = False
 
     @field_validator("rate_hz")
     @classmethod

@@ -40,6 +40,7 @@ SAFETY_PARAMS: Final = np.dtype(
         ("enable_ticks", "i8"),
         ("max_gap", "i8"),
         ("counter_modulus", "i8"),
+        ("shadow", "i8"),
         ("u_lsb", "f8"),
         ("T_L_lsb", "f8"),
         ("J", "f8"),

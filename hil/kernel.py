@@ -32,11 +32,17 @@ def new_safety_state() -> Record:
 
 
 @jit
-def applied_now(s: Any, t: Any) -> None:
+def applied_now(p: Any, s: Any, t: Any) -> None:
     """Find what is applied from this tick on: by the echo when feedback is fresh, else the newest command.
 
-    In every drive state but OPERATION_ENABLED the gates are off: zero.
+    In every drive state but OPERATION_ENABLED the gates are off: zero. In a shadow run it is what another
+    controller was seen to command.
     """
+    if p["shadow"]:
+        on = t["drive_state"] == DriveState.OPERATION_ENABLED
+        s["ua_q"], s["ua_d"] = (t["u_q_seen"], t["u_d_seen"]) if on else (0.0, 0.0)
+        s["ua_T"] = s["T_L"]
+        return
     if not t["rx_flags"] & RxFlag.FRESH:
         s["ua_q"], s["ua_d"], s["ua_T"] = s["u_q"], s["u_d"], s["T_L"]
         return
@@ -48,13 +54,13 @@ def applied_now(s: Any, t: Any) -> None:
 
 
 @jit
-def estimate(s: Any, lp: Any, ls: Any, t: Any) -> None:
+def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """Advance the observer by the past periods; a measurement that is not finite is no measurement."""
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
     finite = math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])
     observe(lp, ls, t["w"], t["i_q"], t["i_d"], fresh and finite, t["gap"])
     t["ua_q"], t["ua_d"] = ls["ua"][1], ls["ua"][2]
-    applied_now(s, t)
+    applied_now(p, s, t)
     apply(ls, s["ua_T"], s["ua_q"], s["ua_d"])
 
 
@@ -95,7 +101,7 @@ def report(p: Any, ls: Any, t: Any) -> None:
 def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
     """Run one tick. ``sp, ss``: safety parameters and state; ``lp, ls``: the law's; ``ticks``: one TICK."""
     p, s, q, law, t = sp[0], ss[0], lp[0], ls[0], ticks[0]
-    estimate(s, q, law, t)
+    estimate(p, s, q, law, t)
     before = s["state"]
     supervise(p, s, t)
     if t["state"] == DriveState.OPERATION_ENABLED and before != DriveState.OPERATION_ENABLED:

@@ -30,7 +30,7 @@ def watching(pid: int, ticks: int | None) -> Iterator[None]:
         yield
         return
     command = [sys.executable, "-m", "hil.progress", str(pid), str(ticks or 0)]
-    drawer = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)  # noqa: S603
+    drawer = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)
     try:
         yield
     finally:

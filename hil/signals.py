@@ -154,6 +154,8 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(31, "log_failed", "u4", "", "input", "1 when the writer reported a failure"),
     Field(32, "T_L_true", "f8", "N m", "input", "true load torque when the drive is an emulator, else NaN"),
     Field(33, "i_q_ref_in", "f8", "A", "input", "reference q current (controller fac), else 0"),
+    Field(34, "u_q_seen", "f8", "V", "input", "shadow run: q voltage of another controller, applied from now on"),
+    Field(35, "u_d_seen", "f8", "V", "input", "shadow run: d voltage of another controller, applied from now on"),
     Field(48, "state", "u4", "", "output", "DriveState of the supervisor"),
     Field(49, "reason", "u4", "", "output", "Reason that latched, 0 while none"),
     Field(50, "guard_flags", "u4", "", "output", "GuardFlag bits"),

@@ -199,7 +199,8 @@ def supervise(p: Any, s: Any, t: Any) -> None:
 
     SWITCH_ON_DISABLED (disarmed) --ARM--> READY_TO_SWITCH_ON -> SWITCHED_ON -> OPERATION_ENABLED
     -> QUICK_STOP_ACTIVE -> SWITCH_ON_DISABLED, or -> FAULT_REACTION_ACTIVE -> FAULT. Disarmed and after a
-    stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down nothing is sent.
+    stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down, and in a shadow run,
+    nothing is sent. A stop that is asked for before arming ends the run there.
     """
     state = s["state"]
     controlword = Controlword.DISABLE_VOLTAGE.value
@@ -214,8 +215,11 @@ def supervise(p: Any, s: Any, t: Any) -> None:
     elif state == DriveState.QUICK_STOP_ACTIVE or state == DriveState.FAULT_REACTION_ACTIVE:
         controlword = stopping(p, s, t)
     else:
+        if s["reason"] == 0:
+            s["reason"] = judge_request(t)
         send = 0
     t["state"] = s["state"]
     t["reason"] = s["reason"]
     t["controlword"] = controlword
-    t["send"] = 0 if (t["rx_flags"] & RxFlag.BUS_DOWN or s["reason"] == Reason.BUS_DOWN) else send
+    down = (t["rx_flags"] & RxFlag.BUS_DOWN) != 0 or s["reason"] == Reason.BUS_DOWN
+    t["send"] = 0 if down or p["shadow"] else send
