@@ -324,3 +324,14 @@ def test_the_papers_plant_reaches_its_operating_point(configs: Path) -> None:
     assert (np.abs(state["x"] - [500.0, 1.5, 0.0]) < [0.2, 0.01, 0.01]).all(), state["x"]
     assert bench.ids() == [0x481, 0x181] and len(bench.link.sent[-1][1]) == 64
     assert (config.disturbance.phi_w_rad_s2, config.disturbance.phi_q_a_s) == (0.1, 0.2)
+
+
+def test_a_reset_bit_that_is_held_resets_nothing(configs: Path) -> None:
+    bench = Bench(configs)
+    bench.sync()
+    bench.enable()
+    assert bench.tick(0x8F) == ENABLED
+    while bench.sync() != FAULT:
+        pass
+    assert [bench.tick(0x8F) for _ in range(3)] == [FAULT] * 3
+    assert [bench.tick(0x0F), bench.tick(0x80)] == [FAULT, DISABLED]
