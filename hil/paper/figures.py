@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from hil.control.linalg import Array
@@ -48,8 +46,15 @@ def estimates(run: Run, name: str, start: float, end: float, units: tuple[str, .
     return Figure(name, f"Disturbance estimation results, {run.case.name}.", panels)
 
 
-def errors(run: Run, name: str, start: float, end: float, units: tuple[str, ...]) -> Figure:
-    """Estimation errors; one panel a channel."""
+def errors(
+    run: Run,
+    name: str,
+    start: float,
+    end: float,
+    units: tuple[str, ...],
+    inset: tuple[float, float] | None = None,
+) -> Figure:
+    """Estimation errors; one panel a channel; ``inset``: times that are enlarged."""
     trace, part = run.continuous, _part(run.continuous, end, start)
     panels = [
         Panel(
@@ -59,21 +64,26 @@ def errors(run: Run, name: str, start: float, end: float, units: tuple[str, ...]
                 _sampled_points(run, run.sampled.error[:, c], end, start),
             ],
             f"$\\vartheta_{c + 1}$" + (f" [{units[c]}]" if units else " [1/s]"),
+            inset=inset,
         )
         for c in range(trace.d.shape[1])
     ]
     return Figure(name, f"Estimation errors of the FTDOB and the conventional DOB, {run.case.name}.", panels)
 
 
-def together(run: Run, name: str, quantity: str, caption: str) -> Figure:
-    """All channels of x or u in one panel."""
+def together(
+    run: Run, name: str, quantity: str, caption: str, inset: tuple[float, float] | None = None
+) -> Figure:
+    """All channels of x or u in one panel; ``inset``: times that are enlarged."""
     trace = run.continuous
     y = trace.x if quantity == "x" else trace.u
     curves = [
         Curve(trace.t, y[:, c], _labelled(CHANNELS[c], f"${quantity}_{c + 1}$")) for c in range(y.shape[1])
     ]
     unit = "1" if quantity == "x" else "1/s"
-    return Figure(name, f"{caption}, {run.case.name}.", [Panel(curves, f"${quantity}$ [{unit}]")])
+    return Figure(
+        name, f"{caption}, {run.case.name}.", [Panel(curves, f"${quantity}$ [{unit}]", inset=inset)]
+    )
 
 
 def _states_6(run: Run) -> Figure:
@@ -83,14 +93,20 @@ def _states_6(run: Run) -> Figure:
     return Figure("fig15", "State trajectory of the system, PMSM as printed (sign error included).", panels)
 
 
-def _case_figures(run: Run, first: int, window: tuple[float, float]) -> list[Figure]:
+def _case_figures(
+    run: Run,
+    first: int,
+    window: tuple[float, float],
+    error_inset: tuple[float, float] | None = None,
+    inset: tuple[float, float] | None = None,
+) -> list[Figure]:
     """The four figures that the paper gives to each case of Sect. 5."""
     names = [f"fig{first + i:02d}" for i in range(4)]
     return [
         estimates(run, names[0], *window, ()),
-        errors(run, names[1], *window, ()),
-        together(run, names[2], "x", "State trajectory of the system"),
-        together(run, names[3], "u", "Control input for three channels"),
+        errors(run, names[1], *window, (), error_inset),
+        together(run, names[2], "x", "State trajectory of the system", inset),
+        together(run, names[3], "u", "Control input for three channels", inset),
     ]
 
 
@@ -99,8 +115,8 @@ def paper_figures(study: Study) -> list[Figure]:
     pmsm = study.runs["PMSM as printed"]
     return [
         *_case_figures(study.runs["case 1"], 1, (0.0, 10.0)),
-        *_case_figures(study.runs["case 2"], 5, (38.0, 68.0)),
-        *_case_figures(study.runs["case 3"], 9, (0.0, 200.0)),
+        *_case_figures(study.runs["case 2"], 5, (38.0, 68.0), None, (38.0, 68.0)),
+        *_case_figures(study.runs["case 3"], 9, (0.0, 200.0), (31.0, 200.0)),
         estimates(pmsm, "fig13", 0.0, 10.0, UNITS_6),
         errors(pmsm, "fig14", 0.0, 10.0, UNITS_6),
         _states_6(pmsm),
@@ -115,17 +131,13 @@ def fixed_time(study: Study) -> Figure:
     names = ("FTDOB, exact sampled form", "FTDOB, Euler", "conventional DOB")
     panels = []
     for curves, look, name in zip((c.ftdob, c.euler, c.dob), looks, names, strict=True):
-        lines = [
-            Curve(c.t, np.maximum(y, 1e-17), {**look, "lw": 1.2, "label": name if i == 0 else "_"})
-            for i, y in enumerate(curves)
-        ]
-        panels.append(Panel(lines, f"|error|\n{name}", log_y=True, vertical=end))
-    plain = [replace(p, curves=[replace(q, look={**q.look, "label": "_"}) for q in p.curves]) for p in panels]
+        lines = [Curve(c.t, np.maximum(y, 1e-17), {**look, "lw": 1.2, "label": "_"}) for y in curves]
+        panels.append(Panel(lines, "|error| [1/s]", log_y=True, title=name, vertical=end))
     caption = (
         "Fixed time: largest error of a channel for ten initial errors from 1e-3 to 1e3, constant d. "
         "From tick N = D/T_s on the exact form is at rounding whatever the start; the others are not."
     )
-    return Figure("fixed_time", caption, plain)
+    return Figure("fixed_time", caption, panels)
 
 
 def corrected(study: Study) -> Figure:
@@ -207,8 +219,8 @@ def bench(study: Study) -> list[Figure]:
     ]
     caption = (
         "The corrected design on the bench (configs/paper.toml): load machine and voltage commanded over the "
-        "bus, the paper's windows and poles, full dq motor, resolution of the FD frames. (c): speed, reference "
-        "yellow."
+        "bus, the paper's windows and poles, full dq motor, resolution of the FD frames. (c): speed, its "
+        "reference yellow."
     )
     return [Figure("bench", caption, [*panels, Panel(speed, "$\\omega$ [rad/s]")])]
 

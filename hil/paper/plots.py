@@ -27,7 +27,7 @@ CHANNELS: Final[tuple[Line, ...]] = (
     {"color": "#c2331d", "lw": 1.5, "ls": "--"},
     {"color": "#3a7d2c", "lw": 1.7, "ls": ":"},
 )
-STYLE: Final[dict[str, Any]] = {
+STYLE: Final[Any] = {
     "font.size": 9,
     "axes.grid": True,
     "grid.color": "#dddddd",
@@ -55,14 +55,14 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes. ``log_y``: logarithmic ordinate; ``log_x``: also abscissa; ``window``: part of t shown."""
+    """One pair of axes. ``log_y``, ``log_x``: logarithmic; ``inset``: part of t enlarged in a corner."""
 
     curves: Sequence[Curve]
     ylabel: str
     log_y: bool = False
     log_x: bool = False
-    window: tuple[float, float] | None = None
     inset: tuple[float, float] | None = None
+    title: str = ""
     vertical: Sequence[tuple[float, str]] = ()
 
 
@@ -90,11 +90,11 @@ def draw(figure: Figure) -> Any:
     with rc_context(STYLE):
         count = len(figure.panels)
         canvas = Canvas(figsize=(6.4, 1.0 + 1.75 * count if count > 1 else 3.2))
-        rows = np.atleast_1d(canvas.subplots(count, 1, sharex=all(p.window is None for p in figure.panels)))
+        rows = np.atleast_1d(canvas.subplots(count, 1, sharex=True))
         for i, (axes, panel) in enumerate(zip(rows, figure.panels, strict=True)):
             _draw_panel(axes, panel)
             if count > 1:
-                axes.set_title(f"({'abcdef'[i]})", loc="left", fontsize=9, fontweight="bold")
+                axes.set_title(f"({'abcdef'[i]}) {panel.title}", loc="left", fontsize=9, fontweight="bold")
         rows[-1].set_xlabel(figure.xlabel)
         handles, labels = rows[0].get_legend_handles_labels()
         if labels:
@@ -110,10 +110,7 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
         axes.set_yscale("log")
     if panel.log_x:
         axes.set_xscale("log")
-    if panel.window:
-        axes.set_xlim(*panel.window)
-    else:
-        axes.margins(x=0.01)
+    axes.margins(x=0.01)
     for at, text in panel.vertical:
         axes.axvline(at, color="#555555", lw=0.8, ls=(0, (2, 2)))
         axes.annotate(text, (at, 0.97), xycoords=("data", "axes fraction"), xytext=(3, 0),
@@ -124,7 +121,7 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
 
 def _draw_inset(axes: Any, panel: Panel, window: tuple[float, float]) -> None:
     """The part of the panel between two times, enlarged in its upper right."""
-    inset = axes.inset_axes((0.58, 0.5, 0.4, 0.46))
+    inset = axes.inset_axes((0.4, 0.42, 0.57, 0.5))
     for curve in panel.curves:
         inside = (curve.t >= window[0] - 1e-9) & (curve.t <= window[1] + 1e-9)
         inset.plot(curve.t[inside], curve.y[inside], **{**curve.look, "label": "_"})
