@@ -1,4 +1,4 @@
-"""Worst-case load of a CAN bus from the messages on it: bits of a frame with all stuff bits, times its rate."""
+"""Worst-case load of a CAN bus by its messages: bits of a frame with all stuff bits, times its rate."""
 
 from __future__ import annotations
 

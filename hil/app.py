@@ -21,6 +21,7 @@ from drivers.bus import BusSettings, Link, open_link
 from drivers.client import DriveClient, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
+from drivers.watch import CommandWatch
 from hil import realtime
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
@@ -28,7 +29,9 @@ from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, HilError
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.ports import Drive
 from hil.progress import say, watching
+from hil.shadow import ShadowDrive
 from hil.signals import Reason, new_ticks
 
 EMULATED_INTERFACES = ("hil-local", "virtual")
@@ -198,15 +201,19 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def opened_client(
-    setup: Setup, recorder: Recorder | None, clock: RealClock | LockstepClock
+    setup: Setup,
+    recorder: Recorder | None,
+    clock: RealClock | LockstepClock,
+    watch: CommandWatch | None = None,
 ) -> Iterator[DriveClient]:
-    """A drive client on the configured bus, closed in the end."""
+    """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
+    on_frame = recorder.frame if recorder and setup.config.log.frames else ignore_frame
     link = open_link(bus_settings(setup.config))
     client = DriveClient(
         link,
         setup.database,
         load=setup.config.controller.kind == "fac",
-        on_frame=recorder.frame if recorder and setup.config.log.frames else ignore_frame,
+        on_frame=watch.chained(on_frame) if watch else on_frame,
         now=clock.now_ns,
     )
     try:
@@ -216,8 +223,8 @@ def opened_client(
 
 
 def check_arming(setup: Setup, arm: bool) -> None:
-    """Refuse a real bus without an explicit ``--arm``."""
-    if arm or is_emulated_bus(setup.config):
+    """Refuse a real bus without an explicit ``--arm``; a shadow run sends nothing and needs none."""
+    if arm or setup.config.loop.shadow or is_emulated_bus(setup.config):
         return
     bus = setup.config.bus
     raise ArmingError(
@@ -243,11 +250,16 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
     recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
     try:
-        with opened_client(setup, recorder, clock) as client:
+        watch = CommandWatch(setup.database) if config.loop.shadow else None
+        with opened_client(setup, recorder, clock, watch) as client:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             _await_drive(setup, client)
-            say(f"arming; log {path}")
-            result = _run_armed(setup, client, recorder, clock, request)
+            say(f"{'listening only' if watch else 'arming'}; log {path}")
+            client.discard()
+            drive = ShadowDrive(client, watch.applied) if watch else client
+            if watch:
+                recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
+            result = _run_armed(setup, drive, recorder, clock, request)
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
         raise
@@ -273,23 +285,23 @@ def plan_of(config: RunConfig) -> Plan:
     """Timing of the run."""
     loop = config.loop
     ticks = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
-    return Plan(loop.period_ns, loop.timeout_ns, loop.pacing, ticks)
+    pacing = "feedback" if loop.shadow and loop.pacing == "sync" else loop.pacing
+    return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks)
 
 
 def _run_armed(
     setup: Setup,
-    client: DriveClient,
+    drive: Drive,
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
 ) -> RunResult:
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
-    loop = Loop(client, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)
+    loop = Loop(drive, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)
     grants: list[realtime.Grant] = []
     outcome, failure = Outcome(), ""
     try:
         with stopping_on_signals(request):
-            client.discard()
             if clock.name == "monotonic":
                 grants = realtime.acquire(setup.config.realtime)
             with watching(os.getpid(), plan.ticks):

@@ -19,6 +19,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil emulate CONFIG           the emulated drive as a process of its own
   hil run CONFIG               the controller, on the bus that CONFIG names
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
+  hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
 """
 EXIT_FAILED, EXIT_REFUSED = 1, 2
@@ -46,6 +47,8 @@ def _overrides(args: argparse.Namespace) -> Overrides:
     settings = list(args.set)
     if getattr(args, "lockstep", False):
         settings.append('loop.clock="lockstep"')
+    if getattr(args, "shadow", False):
+        settings.append("loop.shadow=true")
     if getattr(args, "duration", None) is not None:
         settings.append(f"loop.duration_s={float(args.duration)}")
     return Overrides(args.interface, args.channel, args.bitrate, args.fd, tuple(settings))
@@ -87,16 +90,35 @@ def cmd_demo(args: argparse.Namespace) -> int:
 
 def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
-    from hil.app import load_setup, run
+    from hil.app import check_arming, is_emulated_bus, load_setup, run
+    from hil.arming import confirm, requesting
     from hil.view import run_table, show
 
     setup = load_setup(args.config, _overrides(args))
-    result = run(setup, arm=args.arm)
+    check_arming(setup, args.arm)
+    if not (args.yes or args.shadow or is_emulated_bus(setup.config)):
+        confirm(setup.config, sys.stdin, sys.stderr)
+    with requesting(args.dead_man, sys.stdin, _say) as request:
+        result = run(setup, arm=args.arm, request=request)
     if args.json:
         _print_json(result.as_dict())
     else:
         show(run_table(result))
     return 0 if result.ok else EXIT_FAILED
+
+
+def cmd_check(args: argparse.Namespace) -> int:
+    """Check everything before arming."""
+    from hil.app import load_setup
+    from hil.check import check, check_table, passed
+    from hil.view import show
+
+    rows = check(load_setup(args.config, _overrides(args)))
+    if args.json:
+        _print_json({"rows": [row.as_dict() for row in rows]})
+    else:
+        show(check_table(rows))
+    return 0 if passed(rows) else EXIT_FAILED
 
 
 def cmd_emulate(args: argparse.Namespace) -> int:
@@ -157,9 +179,19 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
     run.add_argument("--arm", action="store_true", help="allow voltage on a bus that is not emulated")
+    run.add_argument("--yes", action="store_true", help="with --arm: do not ask on the terminal")
+    run.add_argument("--shadow", action="store_true", help="read and compute, send nothing, not even SYNC")
+    run.add_argument(
+        "--dead-man",
+        action="store_true",
+        help="stop when standard input closes or, on a terminal, when no key is held for a second",
+    )
     run.add_argument("--duration", type=float, metavar="S", help="stop after S seconds")
     run.add_argument("--lockstep", action="store_true", help="the emulator advances by one period a SYNC")
     _bus_flags(run)
+    check = add("check", cmd_check, "Check interface, drive, limits, bus load and rights. Sends nothing.")
+    check.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
+    _bus_flags(check)
     emulate = add("emulate", cmd_emulate, "Serve the emulated drive that CONFIG names until Ctrl-C.")
     emulate.add_argument(
         "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"

@@ -15,6 +15,9 @@ from hil.guard import SAFETY_PARAMS
 from hil.kernel import new_safety_state, prepare, step
 from hil.signals import TickArray, new_ticks
 
+SHADOW_WAITS = 2**62
+"""Ticks for which a shadow run waits until somebody else enables the drive: for ever."""
+
 Record = npt.NDArray[np.void]
 
 
@@ -119,6 +122,8 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     }
     for name, value in (values | _optional(limits)).items():
         p[name] = value
+    if config.loop.shadow:  # what is applied is somebody else's command, not ours
+        p["deviation_max"] = math.inf
     return p
 
 

@@ -21,12 +21,14 @@ MAX_NS = 2**31 - 1
 class StopRequest:
     """What the operator asks: nothing, a stop (first Ctrl-C, SIGTERM) or a quick stop (second)."""
 
+    STOPS = (int(Request.STOP), int(Request.QUICK_STOP))
+
     def __init__(self) -> None:
         self.value = int(Request.ARM)
 
     def stop(self, *_: object) -> None:
         """Ask for a stop; asked twice, for a quick stop. Safe as a signal handler."""
-        again = self.value in (Request.STOP, Request.QUICK_STOP)
+        again = self.value in self.STOPS
         self.value = int(Request.QUICK_STOP if again else Request.STOP)
 
 
