@@ -18,6 +18,7 @@ from hil.control.law import (
     apply,
     command,
     design_law,
+    known_terms,
     new_law_state,
     observe,
     sampled_model,
@@ -134,3 +135,39 @@ def test_voltages_keep_to_any_circle(kind: Literal["cascade", "fac"]) -> None:
         assert abs(s["u"][0]) <= 1e3, f"seed {seed}, tick {k}"
         assert abs(s["i_q_ref"]) <= 15.0, f"seed {seed}, tick {k}"
         apply(s, s["u"][0], s["u"][1], s["u"][2])
+
+
+def coupling_by_hand(x: np.ndarray) -> np.ndarray:
+    """What (32) has over the linear model, written out with this motor's numbers."""
+    w, i_q, i_d = x
+    torque = 1.5 * 3 * (0.022 - 0.033) * i_d * i_q
+    return np.array([torque / 0.011, -3 * w * 0.022 * i_d / 0.033, 3 * w * 0.033 * i_q / 0.022])
+
+
+def test_known_terms_by_hand() -> None:
+    x, c = np.array([80.0, 6.0, -4.0]), np.empty(3)
+    known_terms(design_law(spec(coupling=True), T_S)[0], x, c)
+    np.testing.assert_allclose(c, coupling_by_hand(x), rtol=1e-12)
+    assert c[0] > 0  # L_d < L_q: a negative i_d adds torque
+    known_terms(design_law(spec(), T_S)[0], x, c)
+    assert c.tolist() == [0.0] * 3
+
+
+def test_known_terms_are_the_mean_of_both_ends() -> None:
+    """Also over a gap: what the model explains by (c(start) + c(end)) / 2 is not left to the estimate."""
+    p, model = design_law(spec(coupling=True), T_S)[0], sampled_model(MOTOR, T_S)
+    ua, d, end = np.array([0.5, 40.0, -20.0]), np.array([-300.0, 50.0, 20.0]), np.array([81.0, 6.5, -2.0])
+    for m in (1, 3):
+        x = np.array([80.0, 6.0, -4.0])
+        for _ in range(60):  # start such that the end is reached exactly: c depends on both
+            forward = x
+            for _ in range(m):
+                mean = (coupling_by_hand(x) + coupling_by_hand(end)) / 2
+                forward = model.Ad @ forward + model.Bd @ ua + model.Ed @ (d + mean)
+            x = x + np.linalg.solve(np.linalg.matrix_power(model.Ad, m), end - forward) * 0.8
+        np.testing.assert_allclose(forward, end, rtol=1e-9)
+        s = new_law_state()[0]
+        apply(s, *ua)
+        observe(p, s, *x, True, 1)
+        observe(p, s, *end, True, m)
+        np.testing.assert_allclose(s["v"], d, rtol=1e-6)
