@@ -31,8 +31,20 @@ def acquire(table: RealtimeTable) -> list[Grant]:
 
 def release() -> None:
     """Give FIFO scheduling back, so that what follows the loop disturbs nobody."""
-    if os.sched_getscheduler(0) == os.SCHED_FIFO:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
+        # the flag stays: only a privileged process may take it back
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+
+
+def probe(table: RealtimeTable) -> list[Grant]:
+    """Ask for everything the config wants and give it back at once; return what would be granted."""
+    cores = os.sched_getaffinity(0)
+    try:
+        return [*_fifo(table.fifo_priority), *_memory(table.lock_memory), *_core(table.cpu)]
+    finally:
+        release()
+        ctypes.CDLL(None).munlockall()
+        os.sched_setaffinity(0, cores)
 
 
 def _fifo(priority: int) -> list[Grant]:

@@ -1,0 +1,88 @@
+"""Listens to a bus and counts what comes: rates, CRCs, counters, newest values. Sends nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from drivers.bus import Frame, Link
+from drivers.codec import Database, Message
+from drivers.errors import LinkDown, LinkError
+
+
+@dataclass(slots=True)
+class Heard:
+    """What was heard of one message; ``values`` are the newest, in the DBC's units."""
+
+    count: int = 0
+    invalid: int = 0
+    jumps: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+    values: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate between the first and the last frame; 0 for fewer than two."""
+        span = self.last_ns - self.first_ns
+        return (self.count - 1) * 1e9 / span if span > 0 else 0.0
+
+
+@dataclass(slots=True)
+class Traffic:
+    """All of it: by message name, and frames that are in no message of the DBC."""
+
+    messages: dict[str, Heard] = field(default_factory=dict)
+    foreign: int = 0
+    error_frames: int = 0
+    down: bool = False
+
+    def of(self, name: str) -> Heard:
+        """What was heard of a message, empty when nothing was."""
+        return self.messages.get(name, Heard())
+
+
+def listen(link: Link, database: Database, seconds: float) -> Traffic:
+    """Listen for ``seconds``; a bus that goes down ends it early."""
+    by_id = {message.can_id: message for message in database.messages.values()}
+    traffic = Traffic()
+    end = time.monotonic_ns() + round(seconds * 1e9)
+    while (left := end - time.monotonic_ns()) > 0 and not traffic.down:
+        try:
+            frame = link.receive(left)
+        except LinkDown:
+            traffic.down = True
+        except LinkError:
+            traffic.error_frames += 1
+        else:
+            if frame is not None:
+                _take(traffic, frame, by_id.get(frame.can_id), time.monotonic_ns())
+    return traffic
+
+
+def _take(traffic: Traffic, frame: Frame, message: Message | None, now_ns: int) -> None:
+    if frame.flags and not (message and message.extended):
+        traffic.error_frames += 1
+    elif message is None:
+        traffic.foreign += 1
+    else:
+        _count(traffic.messages.setdefault(message.name, Heard()), message, frame.data, now_ns)
+
+
+def _count(heard: Heard, message: Message, data: bytes, now_ns: int) -> None:
+    heard.count += 1
+    heard.first_ns = heard.first_ns or now_ns
+    heard.last_ns = now_ns
+    if len(data) != message.length or not message.valid(data):
+        heard.invalid += 1
+        return
+    before = heard.values.get("Counter")
+    heard.values = dict(message.decode(data))
+    if before is not None and message.profile:
+        heard.jumps += heard.values["Counter"] != (before + 1) % message.counter_modulus
+
+
+def occupied(database: Database, rates_hz: Iterable[tuple[str, float]]) -> list[tuple[Message, float]]:
+    """Messages of the DBC with the rates they are sent at; names that it does not have are left out."""
+    return [(database.messages[name], rate) for name, rate in rates_hz if name in database.messages]
