@@ -1,0 +1,275 @@
+"""`hil check`: everything that can be known before arming, as rows of pass, warn or fail. Sends nothing."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from drivers.bus import open_link
+from drivers.busload import bus_load, frame_seconds
+from drivers.errors import DriverError, LinkError
+from drivers.kernel import InterfaceFacts, interface_facts
+from drivers.listen import Heard, Traffic, listen, occupied
+from hil.app import Setup, bus_settings, is_emulated_bus, log_path, needed_bytes
+from hil.config import BusTable, LimitsTable
+from hil.preflight import Row, clock_row, disk_row, realtime_rows, row
+from hil.signals import DriveState
+
+PROTOCOL_VERSION = 1
+MAX_LOAD = 0.7
+MAX_QUEUE = 32
+RATE_TOLERANCE = 0.1
+STATUS_EVERY = 10
+NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
+STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
+SILENT = "a drive that only answers SYNC can't show it before arming; nothing to do"
+
+
+def check(setup: Setup) -> list[Row]:
+    """All rows of a configuration; listens for ``drive.heartbeat_timeout_s`` and sends nothing."""
+    config = setup.config
+    return [
+        *bus_rows(setup),
+        load_row(setup),
+        *heard_rows(setup),
+        *realtime_rows(config.realtime),
+        clock_row(config.loop.period_ns),
+        disk_row(log_path(setup, "check"), needed_bytes(config)),
+    ]
+
+
+def passed(rows: list[Row]) -> bool:
+    """True when no row fails."""
+    return all(r.verdict != "fail" for r in rows)
+
+
+def check_table(rows: list[Row]) -> Table:
+    """The rows for a terminal."""
+    table = Table(title="hil check (nothing was sent)", title_justify="left")
+    for title in ("check", "verdict", "found", "remedy"):
+        table.add_column(title, overflow="fold")
+    for r in rows:
+        table.add_row(r.check, f"[{STYLES[r.verdict]}]{r.verdict}[/]", escape(r.found), escape(r.remedy))
+    return table
+
+
+def bus_rows(setup: Setup) -> list[Row]:
+    """Rows about the interface, from the kernel."""
+    bus = setup.config.bus
+    where = f"{bus.interface}:{bus.channel}"
+    if is_emulated_bus(setup.config):
+        return [Row("interface", "pass", f"{where} is emulated: it has no bitrate, restart or bus state")]
+    if bus.interface != "socketcan":
+        remedy = "check bitrate and bus state with the adapter's own tool"
+        return [Row("interface", "warn", f"{where}: the kernel knows nothing of it", remedy)]
+    try:
+        facts = interface_facts(bus.channel)
+    except DriverError as error:
+        return [Row("interface", "warn", str(error), "install iproute2 and check again")]
+    if facts is None:
+        remedy = "plug in the adapter and load its driver; list interfaces with ip link"
+        return [Row("interface", "fail", f"there is no interface {bus.channel}", remedy)]
+    return interface_rows(facts, bus)
+
+
+def interface_rows(facts: InterfaceFacts, bus: BusTable) -> list[Row]:
+    """Rows of one CAN interface: up, bus state, bitrates, restart, queue."""
+    name = facts.name
+    down = f"ip link set {name} down; ip link set {name} type can"
+    tx, rx, off = facts.tx_errors or 0, facts.rx_errors or 0, facts.bus_off_count or 0
+    counters = f"error counters tx {tx} rx {rx}, {off} times bus-off"
+    rows = [
+        row("interface", facts.up, f"{name} is {'up' if facts.up else 'down'}", f"ip link set {name} up"),
+        row(
+            "bus state",
+            facts.state in (None, "ERROR-ACTIVE"),
+            f"{facts.state}, {counters}",
+            "check wiring, 120 ohm at both ends, bitrate; then take the interface down and up",
+        ),
+        row(
+            "bitrate",
+            facts.bitrate == bus.bitrate,
+            f"{facts.bitrate} bit/s, configured {bus.bitrate}",
+            f"{down} bitrate {bus.bitrate}",
+        ),
+        row(
+            "restart-ms",
+            facts.restart_ms in (None, 0),
+            f"{facts.restart_ms} ms",
+            f"{down} restart-ms 0: after bus-off nothing may be sent by itself",
+        ),
+        row(
+            "transmit queue",
+            facts.queue_length <= MAX_QUEUE,
+            f"{facts.queue_length} frames",
+            f"ip link set {name} txqueuelen 10: old commands must not wait out a bus outage",
+        ),
+    ]
+    return rows + ([_fd_row(facts, bus)] if bus.fd else [])
+
+
+def _fd_row(facts: InterfaceFacts, bus: BusTable) -> Row:
+    wanted = bus.data_bitrate or facts.data_bitrate
+    good = facts.mtu >= 72 and facts.data_bitrate is not None and facts.data_bitrate == wanted
+    found = f"mtu {facts.mtu}, data bitrate {facts.data_bitrate}, configured {bus.data_bitrate}"
+    remedy = f"ip link set {facts.name} down; ip link set {facts.name} type can dbitrate {wanted} fd on"
+    return row("CAN FD", good, found, remedy)
+
+
+def message_rates(setup: Setup) -> list[tuple[str, float]]:
+    """How often each message of the house protocol is on the bus [1/s]; heartbeats by the DBC."""
+    rate = float(setup.config.loop.rate_hz)
+    rates = [("FEEDBACK", rate), ("COMMAND", rate), ("STATUS", rate / STATUS_EVERY)]
+    if setup.config.loop.pacing == "sync":
+        rates.append(("SYNC", rate))
+    if setup.config.controller.kind == "fac":
+        rates.append(("LOAD_COMMAND", rate))
+    beat = setup.database.messages.get("HEARTBEAT")
+    return rates + ([("HEARTBEAT", 1000.0 / beat.cycle_ms)] if beat and beat.cycle_ms else [])
+
+
+def load_row(setup: Setup) -> Row:
+    """Worst-case bus load of this run; other nodes' frames come on top."""
+    bus = setup.config.bus
+    load = bus_load(
+        (
+            frame_seconds(
+                m.length, fd=m.fd, extended=m.extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
+            ),
+            rate,
+        )
+        for m, rate in occupied(setup.database, message_rates(setup))
+    )
+    found = f"{100 * load:.0f} % at {bus.bitrate} bit/s with every stuff bit, without other nodes"
+    remedy = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
+    return row("bus load", load <= MAX_LOAD, found, remedy)
+
+
+def heard_rows(setup: Setup) -> list[Row]:
+    """Rows about the drive, from listening."""
+    config = setup.config
+    try:
+        link = open_link(bus_settings(config))
+    except LinkError as error:
+        return [Row("drive", "fail", str(error), "bring the interface up, then check again")]
+    try:
+        traffic = listen(link, setup.database, config.drive.heartbeat_timeout_s)
+    finally:
+        link.close()
+    return traffic_rows(setup, traffic)
+
+
+def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
+    """Rows about what was heard."""
+    config = setup.config
+    silent_ok = config.loop.pacing == "sync"
+    feedback, status = traffic.of("FEEDBACK"), traffic.of("STATUS")
+    rows = [
+        drive_row(traffic, config.drive.heartbeat_timeout_s),
+        feedback_row(feedback, config.loop.rate_hz, silent_ok),
+        frames_row(traffic),
+        others_row(traffic),
+    ]
+    values = status.values | feedback.values
+    return [
+        *rows,
+        state_row(traffic, values),
+        version_row(values, silent_ok),
+        motion_row(values, config.limits, silent_ok),
+        supply_row(values, config.limits, silent_ok),
+    ]
+
+
+def drive_row(traffic: Traffic, seconds: float) -> Row:
+    """Is there a drive at all."""
+    names = [name for name in ("HEARTBEAT", "FEEDBACK", "STATUS") if traffic.of(name).count]
+    remedy = "is it powered, wired and terminated; are node id and bitrate right?"
+    if traffic.down:
+        return Row("drive", "fail", "the bus went down while listening", remedy)
+    found = f"heard {', '.join(names) or 'nothing'} in {seconds:g} s, {traffic.foreign} frames not in the DBC"
+    return row("drive", bool(names), found, remedy)
+
+
+def feedback_row(feedback: Heard, rate_hz: int, silent_ok: bool) -> Row:
+    """Does feedback come at the rate of the loop."""
+    if feedback.count == 0:
+        if silent_ok:
+            return Row("feedback rate", "warn", "no feedback: it comes with SYNC only", SILENT)
+        return Row("feedback rate", "fail", "no feedback", "switch on the drive's cyclic transmission")
+    near = abs(feedback.rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE
+    found = f"{feedback.rate_hz:.0f} Hz, loop {rate_hz} Hz"
+    return row("feedback rate", near, found, "set loop.rate_hz or the drive's cycle time")
+
+
+def frames_row(traffic: Traffic) -> Row:
+    """Are the frames whole: CRC, length, counter, error frames."""
+    heard = traffic.messages.values()
+    invalid, jumps = sum(h.invalid for h in heard), sum(h.jumps for h in heard)
+    errors = traffic.error_frames
+    found = f"{sum(h.count for h in heard)} frames: {invalid} damaged, {jumps} counter jumps, {errors} errors"
+    good = invalid == jumps == errors == 0
+    return row("frames", good, found, "is the DBC the drive's own; wiring, termination, a second drive?")
+
+
+def others_row(traffic: Traffic) -> Row:
+    """Does somebody else command the drive."""
+    names = [name for name in ("SYNC", "COMMAND", "LOAD_COMMAND") if traffic.of(name).count]
+    found = f"{', '.join(names)} heard" if names else "none heard"
+    return row(
+        "other controller", not names, found, "stop it before arming; --shadow may run beside it", "warn"
+    )
+
+
+def state_row(traffic: Traffic, values: dict[str, float]) -> Row:
+    """State of the drive, from feedback or else from its heartbeat."""
+    remedy = "clear the drive's fault and its cause first"
+    if "State" in values:
+        state, error = DriveState(int(values["State"])), int(values.get("ErrorCode", 0))
+        found = state.name.lower().replace("_", " ") + (f", error 0x{error:04X}" if error else "")
+        if state == DriveState.OPERATION_ENABLED:
+            return Row("drive state", "warn", found, "somebody has enabled it; disable it before arming")
+        return row("drive state", state not in FAULTS and not error, found, remedy)
+    beat = traffic.of("HEARTBEAT").values.get("NmtState")
+    if beat is None:
+        return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
+    found = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"
+    if values.get("ErrorCode"):
+        return Row("drive state", "fail", f"{found}, error 0x{int(values['ErrorCode']):04X}", remedy)
+    return row("drive state", beat == 5, found, "set the drive operational (NMT start)", "warn")
+
+
+def version_row(values: dict[str, float], silent_ok: bool) -> Row:
+    """Does the drive speak our version of the protocol."""
+    if "ProtocolVersion" not in values:
+        return _unseen("protocol version", silent_ok)
+    found = f"{values['ProtocolVersion']:g}, expected {PROTOCOL_VERSION}"
+    good = values["ProtocolVersion"] == PROTOCOL_VERSION
+    return row("protocol version", good, found, "update the drive's firmware or take its own DBC")
+
+
+def motion_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -> Row:
+    """Are speed and currents plausible before arming."""
+    if "Speed" not in values:
+        return _unseen("speed and current", silent_ok)
+    w, i = values["Speed"], max(abs(values.get("CurrentQ", 0.0)), abs(values.get("CurrentD", 0.0)))
+    found = f"{w:.2f} rad/s of {limits.w_max_rad_s:g}, {i:.2f} A of {limits.i_max_a:g}"
+    good = abs(w) < limits.w_max_rad_s and i < limits.i_max_a
+    return row("speed and current", good, found, "sensor scale or offset, DBC, limits")
+
+
+def supply_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -> Row:
+    """Are DC link and temperatures within the limits."""
+    if "DcLinkVoltage" not in values:
+        return _unseen("supply and heat", silent_ok)
+    v = values["DcLinkVoltage"]
+    hot = max(values.get("TemperatureMotor", 0.0), values.get("TemperatureInverter", 0.0))
+    found = f"{v:.1f} V of {limits.v_dc_min_v:g} .. {limits.v_dc_max_v:g}, {hot:.0f} degC"
+    good = limits.v_dc_min_v <= v <= limits.v_dc_max_v and hot < limits.temperature_max_c
+    return row("supply and heat", good, found, "switch on the DC link, let it cool, or correct [limits]")
+
+
+def _unseen(what: str, silent_ok: bool) -> Row:
+    if silent_ok:
+        return Row(what, "warn", "not seen", SILENT)
+    return Row(what, "fail", "not seen", "switch on the drive's cyclic transmission")
