@@ -6,6 +6,7 @@ and for the colour-blind, each with a line style and a width of its own.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -82,23 +83,33 @@ def thin(curve: Curve, most: int = 4000) -> tuple[Array, Array]:
     return curve.t[::step], curve.y[::step]
 
 
-def draw(figure: Figure) -> Any:
-    """Draw with matplotlib's object interface (no global state, no display)."""
+def picture(figure: Figure) -> dict[str, bytes]:
+    """The figure as {"png": ..., "svg": ...}; the same bytes each time (no date, no random ids)."""
     from matplotlib import rc_context
-    from matplotlib.figure import Figure as Canvas
 
     with rc_context(STYLE):
-        count = len(figure.panels)
-        canvas = Canvas(figsize=(6.4, 1.0 + 1.75 * count if count > 1 else 3.2))
-        rows = np.atleast_1d(canvas.subplots(count, 1, sharex=True))
-        for i, (axes, panel) in enumerate(zip(rows, figure.panels, strict=True)):
-            _draw_panel(axes, panel)
-            if count > 1:
-                axes.set_title(f"({'abcdef'[i]}) {panel.title}", loc="left", fontsize=9, fontweight="bold")
-        rows[-1].set_xlabel(figure.xlabel)
-        handles, labels = rows[0].get_legend_handles_labels()
-        if labels:
-            canvas.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5))
+        canvas = _draw(figure)
+        buffers = {"png": io.BytesIO(), "svg": io.BytesIO()}
+        canvas.savefig(buffers["png"], format="png", metadata={"Software": None})
+        canvas.savefig(buffers["svg"], format="svg", metadata={"Date": None})
+    return {kind: buffer.getvalue() for kind, buffer in buffers.items()}
+
+
+def _draw(figure: Figure) -> Any:
+    """Draw with matplotlib's object interface (no global state, no display)."""
+    from matplotlib.figure import Figure as Canvas
+
+    count = len(figure.panels)
+    canvas = Canvas(figsize=(6.4, 1.0 + 1.75 * count if count > 1 else 3.2))
+    rows = np.atleast_1d(canvas.subplots(count, 1, sharex=True))
+    for i, (axes, panel) in enumerate(zip(rows, figure.panels, strict=True)):
+        _draw_panel(axes, panel)
+        if count > 1:
+            axes.set_title(f"({'abcdef'[i]}) {panel.title}", loc="left", fontsize=9, fontweight="bold")
+    rows[-1].set_xlabel(figure.xlabel)
+    handles, labels = rows[0].get_legend_handles_labels()
+    if labels:
+        canvas.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5))
     return canvas
 
 
@@ -120,8 +131,10 @@ def _draw_panel(axes: Any, panel: Panel) -> None:
 
 
 def _draw_inset(axes: Any, panel: Panel, window: tuple[float, float]) -> None:
-    """The part of the panel between two times, enlarged in its upper right."""
-    inset = axes.inset_axes((0.4, 0.42, 0.57, 0.5))
+    """The part of the panel between two times, enlarged on the right, above or below its curves."""
+    shown = panel.curves[-1].y[(panel.curves[-1].t >= window[0]) & (panel.curves[-1].t <= window[1])]
+    high = float(shown.mean()) > 0.5 * sum(axes.get_ylim())
+    inset = axes.inset_axes((0.4, 0.1 if high else 0.42, 0.57, 0.5))
     for curve in panel.curves:
         inside = (curve.t >= window[0] - 1e-9) & (curve.t <= window[1] + 1e-9)
         inset.plot(curve.t[inside], curve.y[inside], **{**curve.look, "label": "_"})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ from hil.paper.errata import errata_items
 from hil.paper.figures import all_figures
 from hil.paper.items import CANNOT, CORRECTED, EQUAL, Item
 from hil.paper.page import page, summary
-from hil.paper.plots import Figure, draw
+from hil.paper.plots import Figure, picture
 from hil.paper.printed import printed_items
 from hil.paper.study import Study, make_study
 from hil.signals import TickArray
@@ -81,11 +80,9 @@ def _title(figure: Figure) -> str:
 
 
 def _write(figure: Figure, out: Path) -> list[Path]:
-    """PNG and SVG of a figure, without a date in them."""
-    canvas = draw(figure)
-    paths = [out / f"{figure.name}.png", out / f"{figure.name}.svg"]
-    for path, metadata in zip(paths, ({"Software": None}, {"Date": None}), strict=True):
-        buffer = io.BytesIO()
-        canvas.savefig(buffer, format=path.suffix[1:], metadata=metadata)
-        path.write_bytes(buffer.getvalue())
+    """PNG and SVG of a figure."""
+    paths = []
+    for kind, content in picture(figure).items():
+        paths.append(out / f"{figure.name}.{kind}")
+        paths[-1].write_bytes(content)
     return paths
