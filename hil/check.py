@@ -216,9 +216,8 @@ def others_row(traffic: Traffic) -> Row:
     """Does somebody else command the drive."""
     names = [name for name in ("SYNC", "COMMAND", "LOAD_COMMAND") if traffic.of(name).count]
     found = f"{', '.join(names)} heard" if names else "none heard"
-    return row(
-        "other controller", not names, found, "stop it before arming; --shadow may run beside it", "warn"
-    )
+    remedy = "stop it before arming; hil run --shadow may run beside it"
+    return row("other controller", not names, found, remedy, "warn")
 
 
 def state_row(traffic: Traffic, values: dict[str, float]) -> Row:
