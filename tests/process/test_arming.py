@@ -235,9 +235,8 @@ def assert_shadowed(path: Path, master_path: Path) -> None:
     assert any(event["kind"] == "shadow" for event in log.events)
     driven = log.ticks[log.ticks["state"] == DriveState.OPERATION_ENABLED]
     assert len(driven) > 2000
-    of_master = {
-        key: tick for key, tick in zip(keys(master := open_log(master_path).ticks), master, strict=True)
-    }
+    master = open_log(master_path).ticks
+    of_master = dict(zip(keys(master), master, strict=True))
     found = [
         (tick, of_master[key]) for key, tick in zip(keys(driven), driven, strict=True) if key in of_master
     ]
