@@ -1,0 +1,239 @@
+"""`hil check` as a process beside real drives, and its rows on facts and traffic made by hand."""
+
+from __future__ import annotations
+
+import json
+import select
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from drivers.kernel import InterfaceFacts
+from drivers.listen import Heard, Traffic
+from drivers.local import open_sockets
+from hil.app import Overrides, Setup, load_setup
+from hil.check import bus_rows, interface_rows, load_row, passed, traffic_rows
+from hil.config import BusTable
+from hil.demo import emulator_process
+from hil.preflight import Row, clock_row, disk_row
+from tests.process.test_run import call, flags
+
+pytestmark = pytest.mark.process
+Settings = Callable[..., tuple[str, ...]]
+WELL = InterfaceFacts("can0", "can", True, 16, 10, "ERROR-ACTIVE", 1_000_000, None, 0, 0, 0, 0)
+
+
+def checked(path: Path, own: tuple[str, ...]) -> tuple[int, dict[str, dict[str, Any]], str]:
+    """Exit code and rows by name of `hil check --json`."""
+    done = call("check", str(path), "--json", *flags(own))
+    assert "Traceback" not in done.stderr, done.stderr
+    return done.returncode, {r["check"]: r for r in json.loads(done.stdout)["rows"]}, done.stderr
+
+
+def verdicts(rows: list[Row]) -> dict[str, str]:
+    return {r.check: r.verdict for r in rows}
+
+
+def setup_of(configs: Path, settings: Settings, *more: str) -> Setup:
+    return load_setup(configs / "demo.toml", Overrides(settings=settings(*more)))
+
+
+def test_a_sync_drive_is_ready_and_nothing_is_sent(configs: Path, settings: Settings, channel: str) -> None:
+    own, path = settings("drive.heartbeat_timeout_s=1.0"), configs / "demo.toml"
+    receiving, sending = open_sockets(channel, own=True)
+    sending.close()
+    try:
+        with emulator_process(path, Overrides(settings=own)):
+            code, rows, _ = checked(path, own)
+            senders = set()
+            while select.select([receiving], [], [], 0.05)[0]:
+                senders.add(receiving.recvfrom(128)[1])
+    finally:
+        receiving.close()
+    assert code == 0
+    assert len(senders) == 1, "hil check sent something"
+    assert "emulated" in rows["interface"]["found"] and rows["drive"]["verdict"] == "pass"
+    assert rows["feedback rate"]["verdict"] == "warn" and rows["drive state"]["verdict"] == "pass"
+    assert set(rows) >= {"bus load", "frames", "other controller", "clock", "disk", "supply and heat"}
+    assert all(set(r) == {"check", "verdict", "found", "remedy"} for r in rows.values())
+    assert all(bool(r["remedy"]) == (r["verdict"] != "pass") for r in rows.values())
+
+
+def test_a_cyclic_drive_shows_everything(configs: Path, settings: Settings) -> None:
+    own = settings("drive.heartbeat_timeout_s=1.0", 'loop.pacing="feedback"')
+    path = configs / "demo.toml"
+    with emulator_process(path, Overrides(settings=own), ('pacing="cyclic"',)):
+        code, rows, _ = checked(path, own)
+    assert code == 0, rows
+    for name in ("feedback rate", "frames", "protocol version", "speed and current", "supply and heat"):
+        assert rows[name]["verdict"] == "pass", rows[name]
+
+
+def test_without_a_drive_it_fails(configs: Path, settings: Settings) -> None:
+    code, rows, _ = checked(configs / "demo.toml", settings("drive.heartbeat_timeout_s=0.3"))
+    assert code == 1
+    assert rows["drive"]["verdict"] == "fail" and "heard nothing" in rows["drive"]["found"]
+    assert rows["drive state"]["verdict"] == "fail"
+
+
+def test_an_interface_that_is_not_there(configs: Path, settings: Settings) -> None:
+    code, rows, _ = checked(configs / "can0.toml", settings('bus.channel="nonecan9"'))
+    assert code == 1
+    assert rows["interface"]["found"] == "there is no interface nonecan9"
+    assert rows["drive"]["verdict"] == "fail"
+
+
+def test_the_table_keeps_its_brackets(configs: Path, settings: Settings) -> None:
+    own = settings("drive.heartbeat_timeout_s=0.3", 'log.folder="/proc/none"')
+    done = call("check", str(configs / "demo.toml"), *flags(own))
+    assert done.returncode == 1 and "[log] folder" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("change", "row"),
+    [
+        ({"up": False}, "interface"),
+        ({"state": "ERROR-PASSIVE"}, "bus state"),
+        ({"state": "BUS-OFF"}, "bus state"),
+        ({"bitrate": 500_000}, "bitrate"),
+        ({"restart_ms": 100}, "restart-ms"),
+        ({"queue_length": 1000}, "transmit queue"),
+    ],
+)
+def test_each_fault_of_an_interface_fails_its_row_alone(change: dict[str, Any], row: str) -> None:
+    bus = BusTable(interface="socketcan", channel="can0")
+    assert passed(interface_rows(WELL, bus))
+    found = verdicts(interface_rows(replace(WELL, **change), bus))
+    assert {name for name, verdict in found.items() if verdict != "pass"} == {row}
+
+
+def test_can_fd_needs_its_data_bitrate() -> None:
+    bus = BusTable(interface="socketcan", channel="can0", fd=True, data_bitrate=2_000_000)
+    fd = replace(WELL, mtu=72, data_bitrate=2_000_000)
+    assert passed(interface_rows(fd, bus))
+    for sick in (WELL, replace(fd, mtu=16), replace(fd, data_bitrate=4_000_000)):
+        assert verdicts(interface_rows(sick, bus))["CAN FD"] == "fail"
+
+
+def test_other_adapters_are_a_warning(configs: Path, settings: Settings) -> None:
+    setup = setup_of(configs, settings, 'bus.interface="slcan"')
+    assert verdicts(bus_rows(setup)) == {"interface": "warn"}
+
+
+@pytest.mark.parametrize(
+    ("more", "percent", "verdict"),
+    [
+        ((), 35, "pass"),  # 65 + 135 + 135 bits a tick, 13.5 of STATUS, heartbeats
+        (("bus.bitrate=500_000",), 70, "pass"),
+        (("loop.rate_hz=1250", "bus.bitrate=500_000"), 87, "fail"),
+        (("bus.bitrate=250_000",), 140, "fail"),
+    ],
+)
+def test_bus_load(
+    configs: Path, settings: Settings, more: tuple[str, ...], percent: int, verdict: str
+) -> None:
+    row = load_row(setup_of(configs, settings, *more))
+    assert row.found.startswith(f"{percent} %") and row.verdict == verdict, row
+
+
+def cyclic(**values: float) -> Traffic:
+    """What a drive in order sends, with some values changed."""
+    feedback = {"Speed": 0.0, "CurrentQ": 0.0, "CurrentD": 0.0, "State": 1, "Counter": 3}
+    status = {"ProtocolVersion": 1, "DcLinkVoltage": 560.0, "TemperatureMotor": 25.0, "ErrorCode": 0}
+    status |= {"TemperatureInverter": 30.0}
+    second = 1_000_000_000
+    of = {
+        "FEEDBACK": Heard(1001, first_ns=1, last_ns=second + 1, values=feedback),
+        "STATUS": Heard(101, first_ns=1, last_ns=second + 1, values=status),
+    }
+    for name, value in values.items():
+        next(h for h in of.values() if name in h.values).values[name] = value
+    return Traffic(of)
+
+
+@pytest.mark.parametrize(
+    ("values", "row", "verdict"),
+    [
+        ({"State": 7}, "drive state", "fail"),
+        ({"State": 4}, "drive state", "warn"),
+        ({"ErrorCode": 0x8130}, "drive state", "fail"),
+        ({"ProtocolVersion": 2}, "protocol version", "fail"),
+        ({"Speed": 151.0}, "speed and current", "fail"),
+        ({"CurrentD": -16.0}, "speed and current", "fail"),
+        ({"DcLinkVoltage": 24.0}, "supply and heat", "fail"),
+        ({"DcLinkVoltage": 700.0}, "supply and heat", "fail"),
+        ({"TemperatureInverter": 111.0}, "supply and heat", "fail"),
+    ],
+)
+def test_each_implausible_value_is_seen(
+    configs: Path, settings: Settings, values: dict[str, float], row: str, verdict: str
+) -> None:
+    setup = setup_of(configs, settings, 'loop.pacing="feedback"')
+    assert set(verdicts(traffic_rows(setup, cyclic())).values()) == {"pass"}
+    found = verdicts(traffic_rows(setup, cyclic(**values)))
+    assert {name: v for name, v in found.items() if v != "pass"} == {row: verdict}
+
+
+def test_rate_damage_and_another_controller_are_seen(configs: Path, settings: Settings) -> None:
+    setup = setup_of(configs, settings, 'loop.pacing="feedback"')
+    slow, damaged, other, down = cyclic(), cyclic(), cyclic(), cyclic()
+    slow.messages["FEEDBACK"].count = 801
+    damaged.messages["FEEDBACK"].invalid = 1
+    other.messages["COMMAND"] = Heard(1, first_ns=1, last_ns=1)
+    down.down = True
+    assert verdicts(traffic_rows(setup, slow))["feedback rate"] == "fail"
+    assert verdicts(traffic_rows(setup, damaged))["frames"] == "fail"
+    assert verdicts(traffic_rows(setup, other))["other controller"] == "warn"
+    assert verdicts(traffic_rows(setup, down))["drive"] == "fail"
+
+
+def test_damaged_frames_and_counter_jumps_on_a_bus(configs: Path, settings: Settings, channel: str) -> None:
+    from drivers.bus import open_link
+    from drivers.listen import listen
+    from hil.app import bus_settings
+
+    setup = setup_of(configs, settings)
+    feedback = setup.database.message("FEEDBACK")
+    link = open_link(bus_settings(setup.config))
+    with can.Bus(interface="hil-local", channel=channel) as bus:
+        for counter in (0, 1, 2, 4, 4):
+            data = feedback.encode({"Counter": counter, "Speed": 1.5})
+            bus.send(can.Message(arbitration_id=0x181, data=data, is_extended_id=False))
+        bus.send(can.Message(arbitration_id=0x181, data=bytes(8), is_extended_id=False))
+        bus.send(can.Message(arbitration_id=0x181, data=bytes(3), is_extended_id=False))
+        bus.send(can.Message(arbitration_id=0x555, data=bytes(3), is_extended_id=False))
+        bus.send(can.Message(is_error_frame=True, is_extended_id=False))
+        traffic = listen(link, setup.database, 0.2)
+    link.close()
+    heard = traffic.of("FEEDBACK")
+    assert (heard.count, heard.invalid, heard.jumps) == (7, 2, 2)
+    assert heard.values["Speed"] == 1.5 and traffic.foreign == 1 and traffic.error_frames == 1
+
+
+def test_clock_and_disk(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.write_text("hpet\n")
+    assert clock_row(1_000_000, source).verdict == "warn"
+    assert clock_row(1, tmp_path / "none").verdict == "warn"
+    assert clock_row(10**12, tmp_path / "none").verdict == "pass"
+    assert disk_row(tmp_path / "a.mcap", 1000).verdict == "pass"
+    assert disk_row(tmp_path / "a.mcap", 1 << 60).verdict == "fail"
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_rights_are_given_back() -> None:
+    import os
+
+    from hil.config import RealtimeTable
+    from hil.realtime import probe
+
+    before = os.sched_getaffinity(0)
+    probe(RealtimeTable(fifo_priority=1, cpu=min(before)))
+    assert os.sched_getaffinity(0) == before
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    assert "VmLck:\t       0 kB" in status
