@@ -89,6 +89,8 @@ def picture(figure: Figure) -> dict[str, bytes]:
 
     with rc_context(STYLE):
         canvas = _draw(figure)
+        canvas.draw_without_rendering()  # lays out once; each saving would do it again
+        canvas.set_layout_engine("none")
         buffers = {"png": io.BytesIO(), "svg": io.BytesIO()}
         canvas.savefig(buffers["png"], format="png", metadata={"Software": None})
         canvas.savefig(buffers["svg"], format="svg", metadata={"Date": None})
@@ -134,7 +136,7 @@ def _draw_inset(axes: Any, panel: Panel, window: tuple[float, float]) -> None:
     """The part of the panel between two times, enlarged on the right, above or below its curves."""
     shown = panel.curves[-1].y[(panel.curves[-1].t >= window[0]) & (panel.curves[-1].t <= window[1])]
     high = float(shown.mean()) > 0.5 * sum(axes.get_ylim())
-    inset = axes.inset_axes((0.4, 0.1 if high else 0.42, 0.57, 0.5))
+    inset = axes.inset_axes((0.4, 0.16 if high else 0.46, 0.57, 0.5))
     for curve in panel.curves:
         inside = (curve.t >= window[0] - 1e-9) & (curve.t <= window[1] + 1e-9)
         inset.plot(curve.t[inside], curve.y[inside], **{**curve.look, "label": "_"})
