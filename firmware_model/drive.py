@@ -137,6 +137,8 @@ def latch(p: Any, s: Any) -> None:
         s["echo"] = s["next_counter"]
         transition(s, s["next_controlword"])
         s["T_commanded"] = s["next_T"]  # together with the voltage of the same tick
+    if s["state"] == State.SWITCH_ON_DISABLED:
+        s["watching"] = 0  # a drive that was switched off properly may be left alone
     if s["state"] != State.OPERATION_ENABLED:
         gates_off(s)
         return

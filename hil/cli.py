@@ -21,6 +21,8 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
   hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
+  hil info LOG, recover LOG    what is in a log; rewrite a damaged one
+  hil paper                    everything the paper prints and draws, recomputed
 """
 EXIT_FAILED, EXIT_REFUSED = 1, 2
 
@@ -156,6 +158,54 @@ def cmd_replay(args: argparse.Namespace) -> int:
     return verdict.exit_code
 
 
+def cmd_paper(args: argparse.Namespace) -> int:
+    """Recompute the paper."""
+    from hil.app import Overrides
+    from hil.demo import closed_loop, find_config
+    from hil.paper import run
+    from hil.view import show
+
+    _say(
+        "paper: the corrected design on the bench over the bus (lockstep), then every figure; under a minute"
+    )
+    settings = ('loop.clock="lockstep"', f'log.folder="{args.output.resolve()}"')
+    _, _, log = closed_loop(find_config("paper.toml"), Overrides(settings=settings))
+    result = run(args.output, log.ticks)
+    if args.json:
+        print(result.to_json())  # noqa: T201
+    else:
+        show(result.table())
+        _say(f"page: {result.page}")
+    return 0
+
+
+def cmd_info(args: argparse.Namespace) -> int:
+    """Say what is in a log."""
+    from hil.log.info import info
+    from hil.view import key_values, show
+
+    found = info(args.log).as_dict()
+    if args.json:
+        _print_json(found)
+    else:
+        show(key_values("hil info", found))
+    return 0
+
+
+def cmd_recover(args: argparse.Namespace) -> int:
+    """Rewrite a damaged log."""
+    from hil.log.recover import recover
+    from hil.view import key_values, show
+
+    out = args.output or args.log.with_suffix(".recovered.mcap")
+    found = recover(args.log, out).as_dict() | {"written": str(out)}
+    if args.json:
+        _print_json(found)
+    else:
+        show(key_values("hil recover", found))
+    return 0
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="hil", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -216,6 +266,17 @@ def _parser() -> argparse.ArgumentParser:
         "replay", cmd_replay, "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 cannot."
     )
     replay.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    paper = add(
+        "paper", cmd_paper, "Recompute all that the paper prints and draws, with a verdict on each item."
+    )
+    paper.add_argument(
+        "-o", "--output", type=Path, default=Path("logs/paper"), metavar="DIR", help="folder for all"
+    )
+    info = add("info", cmd_info, "Say what is in LOG, from its summary alone.")
+    info.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    recover = add("recover", cmd_recover, "Rewrite a damaged LOG with its summary and say what is missing.")
+    recover.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    recover.add_argument("-o", "--output", type=Path, metavar="FILE", help="default: LOG.recovered.mcap")
     return parser
 
 

@@ -21,13 +21,13 @@ from hil.control.observer import bounds
 from hil.design import law_spec, motor_model
 from hil.emulate import load_plant
 from hil.errors import HilError
-from hil.log.reader import open_log
+from hil.log.reader import Log, open_log
 from hil.metrics import Lateness, LoadStep, load_step, tracking_rms
 from hil.replay import Verdict, replay_log
 from hil.signals import TickArray
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-__all__ = ["demo", "emulator_process", "find_config", "resolution_bound"]
+__all__ = ["closed_loop", "demo", "emulator_process", "find_config", "resolution_bound"]
 
 
 def find_config(name: str) -> Path:
@@ -103,14 +103,19 @@ def true_motor(motor: PlantMotor) -> MotorModel:
     )
 
 
-def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
-    """Run the demo; raises HilError with one clear line."""
-    path = path or find_config("demo.toml")
+def closed_loop(path: Path, overrides: Overrides) -> tuple[Setup, RunResult, Log]:
+    """Emulator as a process, controller here, on a bus of their own; the log is read back."""
     if overrides.channel is None:
         overrides = replace(overrides, channel=f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}")
     setup = load_setup(path, overrides)
-    plant, _ = load_plant(path, setup.config)
     with emulator_process(path, overrides):
         result = run(setup)
-    log = open_log(Path(result.log))
+    return setup, result, open_log(Path(result.log))
+
+
+def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
+    """Run the demo; raises HilError with one clear line."""
+    path = path or find_config("demo.toml")
+    setup, result, log = closed_loop(path, overrides)
+    plant, _ = load_plant(path, setup.config)
     return summary(setup, log.ticks, result, replay_log(log), true_motor(plant.motor))

@@ -30,8 +30,8 @@ def simulated(plant: tuple[str, ...], *settings: str) -> TickArray:
 def corner(J: float, psi: float, R: float, L: float) -> tuple[str, ...]:
     """The plant's motor off the controller's belief by these factors."""
     motor = {
-        "J_kg_m2": 0.011 * J, "psi_f_wb": 0.8 * psi, "R_s_ohm": 2.875 * R, "L_d_h": 0.033 * L, "L_q_h": 0.033 * L,
-        "n_p": 3, "B_f_n_m_s": 2e-4,
+        "J_kg_m2": 0.011 * J, "psi_f_wb": 0.8 * psi, "R_s_ohm": 2.875 * R,
+        "L_d_h": 0.033 * L, "L_q_h": 0.033 * L, "n_p": 3, "B_f_n_m_s": 2e-4,
     }  # fmt: skip
     inline = ", ".join(f"{name} = {value!r}" for name, value in motor.items())
     return (f"motor={{ {inline} }}",)
@@ -76,7 +76,8 @@ def test_thirty_percent_off_in_every_corner(factors: tuple[float, float, float, 
         'load=[{kind="constant", torque_n_m=3.0}]',
         'load=[{kind="sine", torque_n_m=2.0, frequency_hz=1.0}]',
         'load=[{kind="fan", k_n_m_s2=5e-4}]',
-        'load=[{kind="coupler", torque_at_zero_gap_n_m=6.0, gap_mm=2.0, decay_length_mm=10.0, slip_at_max_rad_s=40.0}]',
+        'load=[{kind="coupler", torque_at_zero_gap_n_m=6.0, gap_mm=2.0, decay_length_mm=10.0, '
+        "slip_at_max_rad_s=40.0}]",
     ],
 )
 def test_other_loads_are_held_too(load: str) -> None:
@@ -96,6 +97,9 @@ def test_a_voltage_limit_that_is_reached_does_not_wind_up() -> None:
 
 
 def test_a_conventional_dob_runs_through_the_same_loop() -> None:
-    dob = ('observer.speed={kind="dob", gamma_1_rad_s=60.0}', 'observer.current={kind="dob", gamma_1_rad_s=120.0}')
+    dob = (
+        'observer.speed={kind="dob", gamma_1_rad_s=60.0}',
+        'observer.current={kind="dob", gamma_1_rad_s=120.0}',
+    )
     own = operating(simulated((), MATCHED, *dob))
     assert 2.0 < np.abs(own["w"] - own["w_ref"]).max() < 15.0

@@ -97,7 +97,7 @@ def _kernel_tree(cache: Path) -> Path:
         raise MachineError("no kernel package known: run apt-get update")
     shutil.rmtree(tree, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=cache) as folder:
-        os.chmod(folder, 0o755)
+        Path(folder).chmod(0o755)  # apt reads it as another user
         _run("apt-get", "download", package, cwd=Path(folder))
         _run("dpkg", "-x", str(next(Path(folder).glob("*.deb"))), str(tree))
     release = next((tree / "lib" / "modules").iterdir()).name
