@@ -136,7 +136,7 @@ def _draw_inset(axes: Any, panel: Panel, window: tuple[float, float]) -> None:
     """The part of the panel between two times, enlarged on the right, above or below its curves."""
     shown = panel.curves[-1].y[(panel.curves[-1].t >= window[0]) & (panel.curves[-1].t <= window[1])]
     high = float(shown.mean()) > 0.5 * sum(axes.get_ylim())
-    inset = axes.inset_axes((0.4, 0.16 if high else 0.46, 0.57, 0.5))
+    inset = axes.inset_axes((0.4, 0.14 if high else 0.5, 0.57, 0.45))
     for curve in panel.curves:
         inside = (curve.t >= window[0] - 1e-9) & (curve.t <= window[1] + 1e-9)
         inset.plot(curve.t[inside], curve.y[inside], **{**curve.look, "label": "_"})

@@ -176,3 +176,4 @@ def test_fixed_time_is_at_rounding_from_tick_n_on_and_only_in_the_exact_form(stu
     assert (c.ftdob[:, c.N - 1] / c.initial).min() > 1e-4, "not a tick earlier"
     assert (c.euler[:, c.N :] / c.initial[:, None]).min() > 1e-3
     assert (c.dob[:, c.N] / c.initial).min() > 0.4
+    assert c.euler[-1, c.N :].max() / c.initial[-1] == pytest.approx(6.6e-3, rel=0.02)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -77,7 +78,10 @@ def test_every_figure_is_there_as_png_and_svg(result: PaperResult) -> None:
 
 def test_the_page_stands_alone(result: PaperResult) -> None:
     text = result.page.read_text(encoding="utf-8")
-    assert text.count("data:image/svg+xml;base64,") == len(NAMES)
+    inline = re.findall(r"data:image/svg\+xml;base64,([A-Za-z0-9+/=]+)", text)
+    assert [base64.b64decode(data) for data in inline] == [
+        (result.page.parent / f"{name}.svg").read_bytes() for name in NAMES
+    ]
     without = re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
     assert "http" not in without
     assert "<script" not in without
