@@ -1,93 +1,53 @@
-"""Frames by a DBC file: cantools parses it, this module compiles it to shifts, scales and checks.
+"""Frames by a DBC file: cantools parses it, this module compiles each message once, at start.
 
-phys = raw * scale + offset in float64, raw = rint((phys - offset) / scale). A frame is applied whole or not
-at all; a value that does not fit raises.
+A frame is applied whole or not at all; a value that does not fit raises.
 """
 
 from __future__ import annotations
 
-import math
-import struct
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 import cantools
 
-from drivers.e2e import crc_profile_2, crc_profile_5
+from drivers.compiled import Reader, Writer, make_protection, make_reader, make_writer
 from drivers.errors import DatabaseError, DecodeError, EncodeError
+from drivers.local import EFF_FLAG
+from drivers.signal import Signal, compile_signal
 
 MAX_DBC_BYTES = 4 << 20
-_FLOATS = {16: ("<H", "<e"), 32: ("<I", "<f"), 64: ("<Q", "<d")}
-_BROADCAST_TOP = 0x7F
-
-
-@dataclass(frozen=True, slots=True)
-class Signal:
-    """One signal compiled: where its bits are and what they mean."""
-
-    name: str
-    shift: int
-    length: int
-    big_endian: bool
-    signed: bool
-    is_float: bool
-    scale: float
-    offset: float
-    minimum: float
-    maximum: float
-    unit: str
-
-    @property
-    def top(self) -> float:
-        """Largest magnitude that the bits and the DBC's range allow, symmetric about 0."""
-        return min(self.maximum, -self.minimum) if self.minimum < 0 else self.maximum
-
-    def raw_range(self) -> tuple[int, int]:
-        """Smallest and largest raw integer."""
-        half = 1 << (self.length - 1)
-        return (-half, half - 1) if self.signed else (0, 2 * half - 1)
-
-    def to_phys(self, bits: int) -> float:
-        """Physical value of the signal's bits."""
-        if self.is_float:
-            integer, real = _FLOATS[self.length]
-            value = float(struct.unpack(real, struct.pack(integer, bits))[0])
-        else:
-            value = bits - (1 << self.length) if self.signed and bits >> (self.length - 1) else bits
-        return value * self.scale + self.offset
-
-    def to_bits(self, phys: float) -> int:
-        """Bits of a physical value. Raises EncodeError for what is not finite or out of range."""
-        if not math.isfinite(phys):
-            raise EncodeError(f"{self.name}: {phys} can't be sent")
-        value = (phys - self.offset) / self.scale
-        if self.is_float:
-            integer, real = _FLOATS[self.length]
-            return int(struct.unpack(integer, struct.pack(real, value))[0])
-        raw = round(value)
-        low, high = self.raw_range()
-        if not (low <= raw <= high):
-            raise EncodeError(
-                f"{self.name}: {phys} {self.unit} does not fit {low * self.scale + self.offset} .. "
-                f"{high * self.scale + self.offset}"
-            )
-        return raw & ((1 << self.length) - 1)
+FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
+_NODE_BITS = 0x7F
+_WRITERS_KEPT = 64
 
 
 class Message:
-    """One message compiled: identifier, length, protection and signals."""
+    """One message compiled: identifier, length, protection and signals. Raises DatabaseError."""
 
     def __init__(self, parsed: Any, can_id: int, where: str) -> None:
+        where = f"{where}: {parsed.name}"
         self.name: str = parsed.name
         self.can_id = can_id
         self.length: int = parsed.length
-        self.fd = bool(getattr(parsed, "is_fd", False)) or self.length > 8
         self.extended = bool(parsed.is_extended_frame)
-        self.cycle_ms: int | None = parsed.cycle_time
-        self.signals = {s.name: _signal(s, self.length, where, parsed) for s in parsed.signals}
-        self.profile, self._ids = _protection(parsed, where)
+        self.cycle_ms = int(parsed.cycle_time or 0)
+        self.fd = bool(getattr(parsed, "is_fd", False)) or self.length > 8
+        if self.length not in FD_LENGTHS:
+            raise DatabaseError(
+                f"{where}: no CAN frame has {self.length} bytes; use 0..8, 12, 16, 20, 24, 32, 48, 64"
+            )
+        self.signals = _signals(parsed, self.length, where)
+        self.profile, ids = _protection(parsed, where)
+        if self.profile and self.length < 3:
+            raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")
+        self.valid, self._protect = make_protection(self.profile, self.length, ids)
+        self._writers: dict[tuple[str, ...], Writer] = {}
+
+    @property
+    def send_id(self) -> int:
+        """The identifier as it stands in a frame: extended ones carry SocketCAN's flag."""
+        return self.can_id | (EFF_FLAG if self.extended else 0)
 
     @property
     def counter_modulus(self) -> int:
@@ -96,37 +56,34 @@ class Message:
 
     def encode(self, values: Mapping[str, float]) -> bytes:
         """Encode; signals not given are 0. The CRC is filled in. Raises EncodeError."""
-        little = big = 0
-        for name, phys in values.items():
-            signal = self.signals.get(name)
-            if signal is None:
-                raise EncodeError(f"{self.name} has no signal {name}")
-            bits = signal.to_bits(phys) << signal.shift
-            if signal.big_endian:
-                big |= bits
-            else:
-                little |= bits
-        data = bytearray(little.to_bytes(self.length, "little"))
-        if big:
-            for index, byte in enumerate(big.to_bytes(self.length, "big")):
-                data[index] |= byte
-        self.protect(data)
-        return bytes(data)
+        names = tuple(values)
+        writer = self._writers.get(names)
+        if writer is None:
+            if len(self._writers) >= _WRITERS_KEPT:
+                self._writers.clear()
+            writer = self._writers[names] = self.writer(*names)
+        return writer(*values.values())
+
+    def writer(self, *names: str) -> Writer:
+        """A fast function from physical values of ``names`` to the frame's bytes. Raises EncodeError."""
+        signals = [self._known(name) for name in names]
+
+        def refuse(*values: float) -> bytes:
+            for signal, value in zip(signals, values, strict=True):
+                signal.to_bits(value)
+            raise EncodeError(f"{self.name}: {dict(zip(names, values, strict=True))} can't be sent")
+
+        return make_writer(self.length, signals, self._protect, refuse)
+
+    def _known(self, name: str) -> Signal:
+        signal = self.signals.get(name)
+        if signal is None:
+            raise EncodeError(f"{self.name} has no signal {name}")
+        return signal
 
     def protect(self, data: bytearray) -> None:
         """Fill in the CRC of the message's E2E profile."""
-        if self.profile == 2:
-            data[0] = crc_profile_2(bytes(data), self._ids)
-        elif self.profile == 5:
-            data[0:2] = crc_profile_5(bytes(data), int.from_bytes(self._ids, "big")).to_bytes(2, "little")
-
-    def valid(self, data: bytes) -> bool:
-        """True when the CRC fits; the length must fit already."""
-        if self.profile == 2:
-            return data[0] == crc_profile_2(data, self._ids)
-        if self.profile == 5:
-            return data[0] | data[1] << 8 == crc_profile_5(data, int.from_bytes(self._ids, "big"))
-        return True
+        data[:] = self._protect(bytes(data))
 
     def decode(self, data: bytes) -> dict[str, float]:
         """All signals as physical values. Raises DecodeError for a wrong length or CRC."""
@@ -137,49 +94,17 @@ class Message:
         names = tuple(self.signals)
         return dict(zip(names, self.reader(*names)(data), strict=True))
 
-    def reader(self, *names: str) -> Callable[[bytes], tuple[float, ...]]:
-        """Return a fast function from a frame's bytes to the physical values of ``names``."""
-        signals = [self.signals[name] for name in names]
-        plan = [(s.big_endian, s.shift, (1 << s.length) - 1, s.to_phys) for s in signals]
-        any_big = any(s.big_endian for s in signals)
-
-        def read(data: bytes) -> tuple[float, ...]:
-            little = int.from_bytes(data, "little")
-            big = int.from_bytes(data, "big") if any_big else 0
-            return tuple(phys((big if b else little) >> shift & mask) for b, shift, mask, phys in plan)
-
-        return read
+    def reader(self, *names: str, whole: Collection[str] = ()) -> Reader:
+        """A fast function from bytes of the right length to values of ``names``; ``whole`` ones as int."""
+        return make_reader(self.length, [self.signals[name] for name in names], [n in whole for n in names])
 
 
-def _signal(parsed: Any, length: int, where: str, message: Any) -> Signal:
-    """Compile one signal; multiplexed signals are refused, since a frame must apply whole."""
-    if parsed.is_multiplexer or parsed.multiplexer_ids:
-        raise DatabaseError(f"{where}: {message.name}.{parsed.name} is multiplexed; use a plain signal")
-    big = parsed.byte_order == "big_endian"
-    shift = parsed.start
-    if big:
-        from_top = (parsed.start // 8) * 8 + 7 - parsed.start % 8
-        shift = 8 * length - from_top - parsed.length
-    if parsed.is_float and parsed.length not in _FLOATS:
-        raise DatabaseError(f"{where}: {message.name}.{parsed.name}: a float of {parsed.length} bits")
-    scale, offset = float(parsed.scale), float(parsed.offset)
-    half = 1 << (parsed.length - 1)
-    low, high = (-half, half - 1) if parsed.is_signed else (0, 2 * half - 1)
-    minimum = low * scale + offset if parsed.minimum is None else float(parsed.minimum)
-    maximum = high * scale + offset if parsed.maximum is None else float(parsed.maximum)
-    return Signal(
-        parsed.name,
-        shift,
-        parsed.length,
-        big,
-        bool(parsed.is_signed),
-        bool(parsed.is_float),
-        scale,
-        offset,
-        minimum,
-        maximum,
-        parsed.unit or "",
-    )
+def _signals(parsed: Any, length: int, where: str) -> dict[str, Signal]:
+    """Compile the signals; a multiplexed message is refused, since a frame must apply whole."""
+    for signal in parsed.signals:
+        if signal.is_multiplexer or signal.multiplexer_ids:
+            raise DatabaseError(f"{where}.{signal.name} is multiplexed; map a message of plain signals")
+    return {signal.name: compile_signal(signal, length, where) for signal in parsed.signals}
 
 
 def _protection(parsed: Any, where: str) -> tuple[int, bytes]:
@@ -190,21 +115,23 @@ def _protection(parsed: Any, where: str) -> tuple[int, bytes]:
         return 0, b""
     expected = {2: 16, 5: 2}.get(profile)
     if expected is None:
-        raise DatabaseError(f"{where}: {parsed.name}: E2EProfile {profile} is not one of 0, 2, 5")
+        raise DatabaseError(f"{where}: E2EProfile {profile} is not one of 0, 2, 5")
     text = str(attributes["E2EDataIDs"].value) if "E2EDataIDs" in attributes else ""
     try:
         ids = bytes.fromhex(text)
     except ValueError:
         ids = b""
     if len(ids) != expected:
-        raise DatabaseError(
-            f"{where}: {parsed.name}: E2EDataIDs must be {expected} bytes in hex for profile {profile}"
-        )
+        raise DatabaseError(f"{where}: E2EDataIDs must be {expected} bytes in hex for profile {profile}")
     return profile, ids
 
 
 class Database:
-    """A DBC file compiled for one node: CANopen identifiers of the file's node 1 move to ``node_id``."""
+    """A DBC file compiled for one node: CANopen identifiers of the file's node 1 move to ``node_id``.
+
+    A message that can't be used (multiplexed, odd floats) is an error only when it is asked for, since a
+    third-party file holds many that no one maps. ``messages`` holds the usable ones.
+    """
 
     def __init__(self, path: Path, node_id: int = 1) -> None:
         self.path = path
@@ -213,23 +140,32 @@ class Database:
             parsed: Any = cantools.database.load_string(self.text, database_format="dbc", strict=True)
         except Exception as error:
             raise DatabaseError(f"{path}: is no usable DBC: {_first_line(error)}") from error
-        self.messages = {
-            m.name: Message(m, _shifted(m.frame_id, node_id), str(path)) for m in parsed.messages
-        }
+        self.messages: dict[str, Message] = {}
+        self.unusable: dict[str, str] = {}
+        for one in parsed.messages:
+            try:
+                self.messages[one.name] = Message(one, _shifted(one.frame_id, node_id), str(path))
+            except DatabaseError as error:
+                self.unusable[one.name] = str(error)
 
     def message(self, name: str, *signals: str) -> Message:
         """The message ``name``, which must have ``signals``. Raises DatabaseError."""
+        if name in self.unusable:
+            raise DatabaseError(self.unusable[name])
         found = self.messages.get(name)
         if found is None:
-            raise DatabaseError(
-                f"{self.path}: has no message {name}; it has {', '.join(sorted(self.messages))}"
-            )
+            has = ", ".join(sorted(self.messages))
+            raise DatabaseError(f"{self.path}: has no message {name}; it has {has}")
         for signal in signals:
             if signal not in found.signals:
                 raise DatabaseError(
                     f"{self.path}: message {name} has no signal {signal}; it has {', '.join(found.signals)}"
                 )
         return found
+
+    def optional(self, name: str) -> Message | None:
+        """The message ``name`` or None; one that is there and can't be used raises DatabaseError."""
+        return self.message(name) if name in self.messages or name in self.unusable else None
 
 
 def _read(path: Path) -> str:
@@ -247,6 +183,6 @@ def _first_line(error: Exception) -> str:
 
 def _shifted(frame_id: int, node_id: int) -> int:
     """CANopen: the low seven bits are the node; 0 there (SYNC) is for all and stays."""
-    if frame_id > 0x7FF or frame_id & _BROADCAST_TOP == 0:
+    if frame_id > 0x7FF or frame_id & _NODE_BITS == 0:
         return frame_id
     return frame_id - 1 + node_id

@@ -20,15 +20,15 @@ def _crc8_table(polynomial: int) -> bytes:
     return bytes(table)
 
 
-_TABLE = _crc8_table(0x2F)
+CRC8_TABLE = _crc8_table(0x2F)
 
 
 def crc_profile_2(data: bytes, data_ids: bytes) -> int:
     """CRC-8 of a frame whose counter (byte 1, low nibble) picks one of 16 data ids."""
     crc = 0xFF
     for byte in data[1:]:
-        crc = _TABLE[crc ^ byte]
-    return _TABLE[crc ^ data_ids[data[1] & 0x0F]] ^ 0xFF
+        crc = CRC8_TABLE[crc ^ byte]
+    return CRC8_TABLE[crc ^ data_ids[data[1] & 0x0F]] ^ 0xFF
 
 
 def crc_profile_5(data: bytes, data_id: int) -> int:

@@ -1,0 +1,142 @@
+"""One signal of a frame: where its bits are, what they mean, and the exact rules in both directions.
+
+phys = raw * scale + offset in float64, raw = rint((phys - offset) / scale). This is the plain form that
+:mod:`drivers.compiled` unrolls; it also words the error when a value does not fit.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass, replace
+from typing import Any
+
+from drivers.errors import DatabaseError, EncodeError
+
+FLOAT_FORMATS = {16: ("<H", "<e"), 32: ("<I", "<f"), 64: ("<Q", "<d")}
+_ROUNDING = 1e-6  # of a step: a DBC's range is written in decimal digits
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One signal compiled. ``shift`` counts from the frame's end when big endian, else from its start."""
+
+    name: str
+    shift: int
+    length: int
+    big_endian: bool
+    signed: bool
+    is_float: bool
+    scale: float
+    offset: float
+    minimum: float
+    maximum: float
+    unit: str
+
+    @property
+    def top(self) -> float:
+        """Largest magnitude that the bits and the DBC's range allow, symmetric about 0."""
+        return min(self.maximum, -self.minimum) if self.minimum < 0 else self.maximum
+
+    def in_unit(self, unit: str, factor: float) -> Signal:
+        """The same bits in another unit: one ``self.unit`` is ``factor`` of ``unit``."""
+        return replace(
+            self,
+            unit=unit,
+            scale=self.scale * factor,
+            offset=self.offset * factor,
+            minimum=self.minimum * factor,
+            maximum=self.maximum * factor,
+        )
+
+    def raw_range(self) -> tuple[int, int]:
+        """Smallest and largest raw integer that both the bits and the DBC's range allow."""
+        half = 1 << (self.length - 1)
+        low, high = (-half, half - 1) if self.signed else (0, 2 * half - 1)
+        ends = sorted((bound - self.offset) / self.scale for bound in (self.minimum, self.maximum))
+        return max(low, _whole(ends[0], math.ceil, low)), min(high, _whole(ends[1], math.floor, high))
+
+    def to_phys(self, bits: int) -> float:
+        """Physical value of the signal's bits."""
+        if self.is_float:
+            integer, real = FLOAT_FORMATS[self.length]
+            value = float(struct.unpack(real, struct.pack(integer, bits))[0])
+        else:
+            value = bits - (1 << self.length) if self.signed and bits >> (self.length - 1) else bits
+        return value * self.scale + self.offset
+
+    def to_bits(self, phys: float) -> int:
+        """Bits of a physical value. Raises EncodeError for what is not finite or out of range."""
+        if not math.isfinite(phys):
+            raise EncodeError(f"{self.name}: {phys} can't be sent")
+        value = (phys - self.offset) / self.scale
+        if self.is_float:
+            return self._float_bits(phys, value)
+        low, high = self.raw_range()
+        raw = round(value) if math.isfinite(value) else high + 1
+        if not (low <= raw <= high):
+            raise self._misfit(phys, low * self.scale + self.offset, high * self.scale + self.offset)
+        return raw & ((1 << self.length) - 1)
+
+    def _float_bits(self, phys: float, value: float) -> int:
+        integer, real = FLOAT_FORMATS[self.length]
+        try:
+            packed = struct.pack(real, value)
+        except OverflowError:
+            packed = b""
+        if not packed or not self.minimum <= phys <= self.maximum:
+            raise self._misfit(phys, self.minimum, self.maximum)
+        return int(struct.unpack(integer, packed)[0])
+
+    def _misfit(self, phys: float, low: float, high: float) -> EncodeError:
+        low, high = sorted((low, high))
+        return EncodeError(f"{self.name}: {phys} {self.unit} does not fit {low:.12g} .. {high:.12g}")
+
+
+def _whole(end: float, towards: Any, otherwise: int) -> int:
+    """Whole raw number inside a bound; a bound beyond all numbers is none."""
+    slack = _ROUNDING if towards is math.floor else -_ROUNDING
+    return int(towards(end + slack)) if abs(end) < 2.0**64 else otherwise
+
+
+def compile_signal(parsed: Any, length: int, where: str) -> Signal:
+    """Compile cantools' signal of a message of ``length`` bytes. Raises DatabaseError."""
+    scale, offset = float(parsed.scale), float(parsed.offset)
+    if not (math.isfinite(scale) and math.isfinite(offset)) or scale == 0.0:
+        raise DatabaseError(
+            f"{where}.{parsed.name}: scale {scale:g}, offset {offset:g} mean nothing; correct it"
+        )
+    if parsed.is_float and parsed.length not in FLOAT_FORMATS:
+        raise DatabaseError(f"{where}.{parsed.name}: a float of {parsed.length} bits; use 16, 32 or 64")
+    low, high = _bounds(parsed, scale, offset)
+    return Signal(
+        parsed.name,
+        _shift(parsed, length),
+        parsed.length,
+        parsed.byte_order == "big_endian",
+        bool(parsed.is_signed),
+        bool(parsed.is_float),
+        scale,
+        offset,
+        low if parsed.minimum is None else float(parsed.minimum),
+        high if parsed.maximum is None else float(parsed.maximum),
+        parsed.unit or "",
+    )
+
+
+def _bounds(parsed: Any, scale: float, offset: float) -> tuple[float, float]:
+    """Smallest and largest physical value of the bits."""
+    if parsed.is_float:
+        return -math.inf, math.inf
+    half = 1 << (parsed.length - 1)
+    ends = (-half, half - 1) if parsed.is_signed else (0, 2 * half - 1)
+    low, high = sorted(end * scale + offset for end in ends)
+    return low, high
+
+
+def _shift(parsed: Any, length: int) -> int:
+    """Bits below the signal; a big-endian signal's start is its top bit, counted within its byte."""
+    if parsed.byte_order != "big_endian":
+        return int(parsed.start)
+    from_top = (parsed.start // 8) * 8 + 7 - parsed.start % 8
+    return int(8 * length - from_top - parsed.length)
