@@ -109,6 +109,11 @@ def test_a_bench_that_misses_phi_is_no_success() -> None:
     assert [item.verdict for item in _bench_item(study)] == [CANNOT]
 
 
+def test_a_bench_run_that_ended_early_is_no_success() -> None:
+    study = make_study(bench()[:400])
+    assert [item.verdict for item in _bench_item(study)] == [CANNOT]
+
+
 def test_helpers_can_fail() -> None:
     assert same_digits([0.0031], [0.00314], 4)
     assert not same_digits([0.0031], [0.00316], 4)
