@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/numba
-JITTED := tests/unit tests/property tests/contract
+JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py tests/unit/test_drivers*.py) \
+    tests/unit/test_guard.py tests/unit/test_supervisor.py tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
 .PHONY: demo test lint unit interpreted vm clean help

@@ -184,8 +184,8 @@ def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) ->
     """
     flags = 0
     if not (math.isfinite(u_q) and math.isfinite(u_d) and math.isfinite(T_L)):
-        u_q, u_d, T_L = 0.0, 0.0, 0.0
-        flags |= GuardFlag.NOT_A_NUMBER.value
+        write_command(s, t, 0.0, 0.0, 0.0, GuardFlag.NOT_A_NUMBER.value)
+        return Reason.CONTROLLER_ERROR.value
     if is_denormal(u_q) or is_denormal(u_d) or is_denormal(T_L):
         u_q = 0.0 if is_denormal(u_q) else u_q
         u_d = 0.0 if is_denormal(u_d) else u_d
@@ -197,7 +197,8 @@ def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) ->
     limit = voltage_limit(p, s)
     norm = math.sqrt(u_q * u_q + u_d * u_d)
     if norm > limit:
-        u_q, u_d = u_q * limit / norm, u_d * limit / norm
+        ratio = limit / norm  # 0 for a norm that overflows
+        u_q, u_d = u_q * ratio, u_d * ratio
         flags |= GuardFlag.SOFT_START.value if limit < p["u_max"] else GuardFlag.VOLTAGE.value
     step_q, step_d = limit_step(u_q, s["u_q"], p["du_max"]), limit_step(u_d, s["u_d"], p["du_max"])
     flags |= GuardFlag.VOLTAGE_STEP.value if (step_q != u_q or step_d != u_d) else 0
@@ -223,10 +224,8 @@ def write_command(s: Any, t: Any, u_q: float, u_d: float, T_L: float, flags: int
 def persistent_excess(p: Any, s: Any, flags: int) -> int:
     """Return GUARD_PERSISTENT once the guard has had to change the command for guard_trip_ticks in a row.
 
-    The soft start is a planned limit and does not count; a command that is not a number counts at once.
+    The soft start is a planned limit and does not count.
     """
     changed = flags & ~(GuardFlag.SOFT_START.value | GuardFlag.DENORMAL.value)
     s["clamped"] = s["clamped"] + 1 if changed else 0
-    if flags & GuardFlag.NOT_A_NUMBER.value:
-        return Reason.CONTROLLER_ERROR.value
     return Reason.GUARD_PERSISTENT.value if s["clamped"] >= p["guard_trip_ticks"] else Reason.NONE.value

@@ -96,9 +96,9 @@ class Loop:
             now_ns = clock.sleep_until(deadline_ns) if plan.pacing != "feedback" else clock.now_ns()
             k, gap = self._skip(k, deadline_ns, now_ns)
             self._one(tick, k, start_ns + k * plan.period_ns, gap, now_ns)
+            outcome.ticks += 1
             if self._ended(tick, k):
                 return
-            outcome.ticks += 1
             k += 1
 
     def _skip(self, k: int, deadline_ns: int, now_ns: int) -> tuple[int, int]:

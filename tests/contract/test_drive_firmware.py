@@ -267,6 +267,7 @@ def test_a_flood_does_not_keep_the_watchdog_from_tripping(configs: Path) -> None
     )
 
 
+@pytest.mark.compiled  # real time: interpreted kernels are too slow for it
 def test_a_cyclic_drive_keeps_its_own_time(configs: Path) -> None:
     bench = Bench(configs, clock="realtime", pacing="cyclic")
     bench.node.warm_up()

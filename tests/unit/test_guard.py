@@ -129,6 +129,7 @@ def test_an_applied_voltage_that_deviates_trips_when_it_persists() -> None:
     assert not guard.t["guard_flags"] & GuardFlag.APPLIED_DEVIATES
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy scalars warn where compiled code does not
 @given(u_q=ANY, u_d=ANY, T_L=ANY, before_q=st.floats(-300, 300), state=st.sampled_from(list(DriveState)))
 @settings(max_examples=300, deadline=None)
 def test_whatever_is_asked_what_leaves_is_safe(

@@ -88,7 +88,7 @@ def test_read_judge_compute_write_record_in_order() -> None:
     outcome = loop.run()
     assert drive.calls == ["sync", "receive", "send"] * 2 + ["sync", "receive", "stop"]
     assert [int(t["k"][0]) for t in memory.ticks] == [0, 1, 2]
-    assert (outcome.ticks, outcome.skipped, outcome.reason) == (2, 0, Reason.STOP_REQUESTED)
+    assert (outcome.ticks, outcome.skipped, outcome.reason) == (3, 0, Reason.STOP_REQUESTED)
 
 
 def test_deadlines_are_absolute() -> None:
@@ -180,7 +180,7 @@ def test_a_run_without_length_goes_on_until_it_is_stopped() -> None:
     loop, _, request = make(
         drive, FakeClock(on_sleep=lambda d: request.stop() if d == 50 * MS else None), None
     )
-    assert loop.run().ticks == 50
+    assert loop.run().ticks == 51
 
 
 def test_outcome_starts_empty() -> None:

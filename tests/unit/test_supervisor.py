@@ -257,6 +257,7 @@ def test_i2t_recovers_below_the_continuous_current() -> None:
     assert t["reason"] == Reason.NONE
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy scalars warn where compiled code does not
 @pytest.mark.parametrize("seed", range(3))
 def test_random_inputs_never_send_voltage_outside_operation(seed: int) -> None:
     rng = np.random.default_rng(seed)
