@@ -27,7 +27,7 @@ def host_has_can() -> bool:
 
 
 def run_natively(out: Path) -> str:
-    environment = os.environ | {"OUT": str(out)}
+    environment = os.environ | {"OUT": str(out), "PYTHONPATH": str(ROOT)}
     done = subprocess.run(
         [sys.executable, "tests/vm/guest/suite.py"],
         cwd=ROOT,

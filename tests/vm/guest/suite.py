@@ -16,18 +16,68 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from hil import cli
+from hil.config import RunConfig, load_toml
+from hil.emulate import make_node
+
 OUT = Path(os.environ["OUT"])
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
-FOREVER_S = 1e5  # waiting for the host's files lets virtual time run; the host bounds the whole in real time
 
 
 def sh(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def hil(*words: str, **options: object) -> subprocess.Popen[str]:
-    return subprocess.Popen([sys.executable, "-m", "hil.cli", *words], text=True, **options)  # type: ignore[call-overload]
+class Forked:
+    """A hil command as a process of its own, forked after the imports, which take long in the machine."""
+
+    def __init__(self, output: Path, *words: str) -> None:
+        self.output, self._code = output, None
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._become(words)
+
+    def _become(self, words: tuple[str, ...]) -> None:
+        code = 70
+        try:
+            target = os.open(self.output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            os.dup2(target, 1)
+            code = cli.main(list(words))
+            sys.stdout.flush()
+        except SystemExit as error:
+            code = int(error.code or 0)
+        finally:
+            os._exit(code)
+
+    def poll(self) -> int | None:
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def wait(self) -> int:
+        while (code := self.poll()) is None:
+            time.sleep(0.01)
+        return code
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def said(self) -> str:
+        return self.output.read_text() if self.output.exists() else ""
+
+
+def warm_up() -> None:
+    """Import everything and load the compiled kernels once, before any process is forked."""
+    from hil.app import Overrides, load_setup
+    from hil.simulate import simulate_ticks
+
+    simulate_ticks(load_setup(Path(CONFIG), Overrides(settings=("loop.duration_s=0.05",))))
+    node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
+    node[0].warm_up()
+    node[1].close()
 
 
 class Scenario:
@@ -43,18 +93,16 @@ class Scenario:
 
     def __enter__(self) -> Scenario:
         self._candump = subprocess.Popen(["candump", "-L", self.controller], stdout=self.dump.open("w"))
-        self.emulator = hil("emulate", CONFIG, "-c", self.drive, stdout=subprocess.PIPE)
-        assert self.emulator.stdout is not None
-        self.ready = self.emulator.stdout.readline()
+        self.emulator = Forked(self.folder / "emulator.txt", "emulate", CONFIG, "-c", self.drive)
+        while "ready" not in self.emulator.said() and self.emulator.poll() is None:
+            time.sleep(0.01)
         return self
 
-    def start(self, *more: str) -> subprocess.Popen[str]:
+    def start(self) -> None:
         folder = ["--set", f'log.folder="{self.folder}"', "--set", f"loop.duration_s={self.seconds}"]
         arm = [] if self.controller.startswith("vcan") else ["--arm", "--yes"]
-        self.run = hil(
-            "run", CONFIG, "-c", self.controller, "--json", *arm, *folder, *more, stdout=subprocess.PIPE
-        )
-        return self.run
+        words = ("run", CONFIG, "-c", self.controller, "--json", *arm, *folder)
+        self.run = Forked(self.folder / "run.json", *words)
 
     def running(self) -> None:
         """Wait until commands are on the bus and the drive has been in operation for a while."""
@@ -62,16 +110,13 @@ class Scenario:
             time.sleep(0.01)
 
     def __exit__(self, *_: object) -> None:
-        out, _err = self.run.communicate(timeout=FOREVER_S)
-        self.emulator.terminate()
-        tail, _err = self.emulator.communicate(timeout=FOREVER_S)
+        code = self.run.wait()
+        self.emulator.send_signal(signal.SIGTERM)
+        self.emulator.wait()
         self._candump.terminate()
         self._candump.wait()
-        result = {
-            "returncode": self.run.returncode,
-            "run": json.loads(out or "{}"),
-            "emulator": self.ready + tail,
-        }
+        said = json.loads(self.run.said() or "{}")
+        result = {"returncode": code, "run": said, "emulator": self.emulator.said()}
         (self.folder / "result.json").write_text(json.dumps(result))
         shutil.copytree(self.folder, OUT / self.name)
 
@@ -99,7 +144,7 @@ def interface_goes_down_and_up() -> None:
         time.sleep(0.3)
         sh("ip", "link", "set", "vcan0", "up")
         after = subprocess.Popen(["candump", "-L", "vcan0"], stdout=(s.folder / "after.log").open("w"))
-        s.run.wait(FOREVER_S)
+        s.run.wait()
         time.sleep(0.5)
         after.terminate()
 
@@ -142,7 +187,7 @@ def no_partner_fills_the_queue() -> None:
         s.start()
         s.running()
         sh("ip", "link", "set", "can1", "down")
-        s.run.wait(FOREVER_S)
+        s.run.wait()
         (s.folder / "link.json").write_text(
             sh("ip", "-json", "-details", "-statistics", "link", "show", "can0")
         )
@@ -161,6 +206,9 @@ def main() -> int:
         no_partner_fills_the_queue,
     ]
     wanted = sys.argv[1:]
+    begin = time.monotonic()
+    warm_up()
+    print(f"warm-up: {time.monotonic() - begin:.1f} s", flush=True)
     for scenario in scenarios:
         if wanted and scenario.__name__ not in wanted:
             continue
