@@ -143,7 +143,7 @@ def _job(script: str) -> str:
     python = Path(sys.executable).parent
     return f"""\
 export PATH={shlex.quote(str(python))}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
-export PYTHONPATH={shlex.quote(str(ROOT))} HOME=/dev/shm TMPDIR=/dev/shm OUT=/mnt LANG=C.UTF-8 HIL_IN_MACHINE=1
+export PYTHONPATH={shlex.quote(str(ROOT))} HOME=/dev/shm TMPDIR=/dev/shm OUT=/mnt LANG=C.UTF-8
 export NUMBA_CACHE_DIR=/dev/shm/numba PYTHONDONTWRITEBYTECODE=1 OPENBLAS_NUM_THREADS=1
 [ -d {shlex.quote(cache)} ] && cp -r {shlex.quote(cache)} /dev/shm/numba
 ip link set lo up
