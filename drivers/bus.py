@@ -16,10 +16,12 @@ from typing import NamedTuple, Protocol
 import can
 
 from drivers.errors import LinkDown, LinkError, QueueFull
-from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, pack_frame
+from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, check_length, pack_frame
 
 _DOWN = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
 _FULL = {errno.ENOBUFS, errno.EAGAIN}
+_FLAGS = EFF_FLAG | RTR_FLAG | ERR_FLAG
+DISCARD_MOST = 100_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,42 +71,63 @@ def raise_link_error(error: OSError, action: str) -> None:
 
 
 class SocketLink:
-    """A link over sockets of SocketCAN's frame layout."""
+    """A link over sockets of SocketCAN's frame layout. ``fd``: the bus was opened for CAN FD."""
 
-    def __init__(self, bus: can.BusABC, receiving: socket.socket, sending: socket.socket) -> None:
-        self._bus, self._receiving, self._sending = bus, receiving, sending
-        self._fds = [receiving.fileno()]
+    def __init__(
+        self, bus: can.BusABC, receiving: socket.socket, sending: socket.socket, fd: bool = True
+    ) -> None:
+        self._bus, self._receiving, self._sending, self._fd = bus, receiving, sending, fd
         receiving.setblocking(False)
+        self._fds = [receiving.fileno()]
+        poll = select.poll()
+        poll.register(receiving, select.POLLIN)
+        self._poll = poll.poll
+        self._recv, self._write = receiving.recv, sending.send
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
+        if fd and not self._fd:
+            raise LinkError(
+                errno.EINVAL, "can't send a CAN FD frame: the bus is opened without fd; set bus.fd"
+            )
         try:
-            self._sending.send(pack_frame(can_id, data, fd))
+            self._write(pack_frame(can_id, data, fd))
         except OSError as error:
             raise_link_error(error, "send")
 
     def receive(self, timeout_ns: int) -> Frame | None:
-        """Return the next frame, or None."""
+        """Return the next frame, or None. With no time to wait, poll tells without an exception."""
         try:
-            if timeout_ns > 0 and not select.select(self._fds, [], [], timeout_ns * 1e-9)[0]:
+            ready = (
+                select.select(self._fds, [], [], timeout_ns * 1e-9)[0] if timeout_ns > 0 else self._poll(0)
+            )
+            if not ready:
                 return None
-            raw = self._receiving.recv(128)
+            raw = self._recv(128)
         except BlockingIOError:
             return None
+        except ValueError:  # the descriptor of a closed link
+            raise_link_error(OSError(errno.EBADF, "closed"), "receive")
         except OSError as error:
             raise_link_error(error, "receive")
         return _unpack(raw)
 
     def discard(self) -> int:
         """Throw away what is queued."""
-        count = 0
-        while self.receive(0) is not None:
-            count += 1
-        return count
+        return _discard(self)
 
     def close(self) -> None:
         """Close the bus."""
+        self._fds = [-1]
         self._bus.shutdown()
+
+
+def _discard(link: Link) -> int:
+    """Read until nothing is there; a flood can't hold the caller longer than the bound."""
+    count = 0
+    while count < DISCARD_MOST and link.receive(0) is not None:
+        count += 1
+    return count
 
 
 def _unpack(raw: bytes) -> Frame | None:
@@ -119,8 +142,8 @@ def _unpack(raw: bytes) -> Frame | None:
         return None
     if length > top:
         return None
-    flags = can_id & (EFF_FLAG | RTR_FLAG | ERR_FLAG)
-    return Frame(can_id & 0x1FFFFFFF, data[:length], flags, fd)
+    # the named tuple's own constructor is a Python function and costs twice as much
+    return tuple.__new__(Frame, (can_id & 0x1FFFFFFF, data[:length], can_id & _FLAGS, fd))
 
 
 class GenericLink:
@@ -131,6 +154,7 @@ class GenericLink:
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
+        check_length(data, fd)
         message = can.Message(
             arbitration_id=can_id & 0x1FFFFFFF,
             is_extended_id=bool(can_id & EFF_FLAG),
@@ -146,21 +170,23 @@ class GenericLink:
     def receive(self, timeout_ns: int) -> Frame | None:
         """Return the next frame, or None."""
         try:
-            message = self._bus.recv(timeout_ns * 1e-9)
+            message = self._bus.recv(max(0, timeout_ns) * 1e-9)
         except can.CanError as error:
             raise LinkError(errno.EIO, f"can't receive: {error}") from error
         if message is None:
             return None
         flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
         flags |= ERR_FLAG if message.is_error_frame else 0
-        return Frame(message.arbitration_id, bytes(message.data), flags, message.is_fd)
+        return Frame(
+            message.arbitration_id,
+            b"" if message.is_remote_frame else bytes(message.data),
+            flags,
+            message.is_fd,
+        )
 
     def discard(self) -> int:
         """Throw away what is queued."""
-        count = 0
-        while self.receive(0) is not None:
-            count += 1
-        return count
+        return _discard(self)
 
     def close(self) -> None:
         """Close the bus."""
@@ -186,9 +212,9 @@ def open_link(settings: BusSettings) -> Link:
             errno.ENODEV, f"can't open bus {settings.interface}:{settings.channel}: {error}; {remedy}"
         ) from error
     if isinstance(bus, LocalBus):
-        return SocketLink(bus, bus.receiving, bus.sending)
+        return SocketLink(bus, bus.receiving, bus.sending, settings.fd)
     if settings.interface == "socketcan":
-        return SocketLink(bus, bus.socket, bus.socket)  # type: ignore[attr-defined]
+        return SocketLink(bus, bus.socket, bus.socket, settings.fd)  # type: ignore[attr-defined]
     return GenericLink(bus)
 
 

@@ -1,4 +1,4 @@
-"""The drive client: one drive of the house protocol on a link, seen as a port of the control loop.
+"""The drive client: one drive on a link, seen as a port of the control loop.
 
 Fills a tick record in place by field name, so it needs no knowledge of who owns the record. What arrives
 damaged, repeated or of the wrong length is flagged and not applied; a bus that is down is flagged and
@@ -7,32 +7,38 @@ nothing is sent until the client is closed.
 
 from __future__ import annotations
 
-import struct
 import time
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
+from drivers.binding import Binding, bind
 from drivers.bus import Frame, Link
 from drivers.codec import Database, Message
-from drivers.errors import LinkDown, LinkError
+from drivers.errors import LinkDown, LinkError, QueueFull
+from drivers.frames import (
+    BUS_DOWN,
+    EMERGENCY,
+    ERROR_FRAME,
+    FOREIGN_COMMAND,
+    FRESH,
+    LENGTH_ERROR,
+    SEND_FAILED,
+    STATUS,
+    Incoming,
+    Outgoing,
+)
 from drivers.local import ERR_FLAG
-
-FRESH: Final = 1 << 0
-CRC_ERROR: Final = 1 << 1
-COUNTER_REPEATED: Final = 1 << 2
-COUNTER_JUMP: Final = 1 << 3
-LENGTH_ERROR: Final = 1 << 4
-STATUS: Final = 1 << 5
-EMERGENCY: Final = 1 << 6
-ERROR_FRAME: Final = 1 << 7
-BUS_DOWN: Final = 1 << 8
-FOREIGN_COMMAND: Final = 1 << 9
-SEND_FAILED: Final = 1 << 10
+from drivers.mapping import MEASURED, DriveMap, house_map
+from drivers.record import Cell, TranslatedCell, cell_of
+from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
 
 STOP_REPEATS: Final = 5
+STOP_PAUSE_S: Final = 0.002
+DRAIN_MOST: Final = 256
 OnFrame = Callable[[bool, int, int, bytes], None]
-Handler = Callable[[Any, Frame], int]
+Handler = Callable[[bytes], int]
+_SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
 
 
 def ignore_frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
@@ -40,7 +46,10 @@ def ignore_frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
 
 
 class DriveClient:
-    """A drive on a link. ``now`` stamps frames; ``on_frame`` sees each frame sent or received."""
+    """A drive on a link. ``now`` stamps frames; ``on_frame`` sees each frame sent or received.
+
+    ``drive_map`` says which frame plays which part; without one the DBC is of the house protocol.
+    """
 
     def __init__(
         self,
@@ -50,156 +59,160 @@ class DriveClient:
         load: bool = False,
         on_frame: OnFrame = ignore_frame,
         now: Callable[[], int] = time.monotonic_ns,
+        drive_map: DriveMap | None = None,
     ) -> None:
         self._link, self._on_frame, self._now = link, on_frame, now
+        self._quiet = on_frame is ignore_frame
+        self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
         self.seen: Counter[int] = Counter()
-        self._sync_id = database.message("SYNC").can_id
-        self._sync_counter = 0
-        self._command = database.message("COMMAND", "Counter", "Controlword", "VoltageQ", "VoltageD")
-        self._feedback = database.message(
-            "FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State"
-        )
-        self._load = (
-            database.message("LOAD_COMMAND") if load and "LoadTorque" not in self._command.signals else None
-        )
-        self._with_load = load and self._load is None
-        self._counter_modulus = self._feedback.counter_modulus
-        self._last_counter = -1
-        self._last_sent = 0
+        self._sync_counter = self._last_sent = self._last_controlword = 0
         self._pending_flags = 0
-        self._down = False
-        self._late = False
-        self._prepare(database)
+        self._down = self._late = False
+        self._tick: Any = None
+        self._sent_cells: list[Cell] = []
+        self._incoming = [Incoming(bound) for bound in self.binding.incoming]
+        self._outgoing = [Outgoing(bound) for bound in self.binding.outgoing]
+        self._needed = self._got = 0
+        self._handlers: dict[int, Handler] = {}
+        self._register()
 
-    def _prepare(self, database: Database) -> None:
-        """Compile the readers and the table of who handles which identifier."""
-        names = ["Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State", "Limited"]
-        extra = ["DcLinkVoltage", "TemperatureMotor", "TemperatureInverter", "ErrorCode"]
-        self._status_inside = all(name in self._feedback.signals for name in extra)
-        self._read_feedback = self._feedback.reader(*names)
-        self._handlers: dict[int, Handler] = {self._command.can_id: self._on_foreign}
-        if self._status_inside:
-            self._read_status = self._feedback.reader(*extra)
-        elif "STATUS" in database.messages:
-            self._status = database.message("STATUS", *extra)
-            self._read_status = self._status.reader(*extra)
-            self._handlers[self._status.can_id] = self._on_status
-        if "TRUTH" in database.messages:
-            self._handlers[database.message("TRUTH").can_id] = self._on_truth
-        self._emergency_id = database.message("EMCY").can_id if "EMCY" in database.messages else -1
-        self._handlers[self._emergency_id] = self._on_emergency
-        self.heartbeat_id = database.message("HEARTBEAT").can_id if "HEARTBEAT" in database.messages else -1
-        self.feedback_id, self.command_id = self._feedback.can_id, self._command.can_id
+    def _register(self) -> None:
+        """Fill the table of who handles which identifier."""
+        binding = self.binding
+        alive = [bound.message for bound in binding.incoming]
+        for index, (bound, incoming) in enumerate(zip(binding.incoming, self._incoming, strict=True)):
+            bit = 1 << index if set(incoming.parts) & set(MEASURED) else 0
+            self._needed |= bit
+            self._handlers[bound.message.send_id] = self._handler(incoming, bit)
+        foreign = [bound.message for bound in binding.outgoing] + [binding.sync] * (binding.sync is not None)
+        self._handlers |= {message.send_id: self._on_foreign for message in foreign if message}
+        if binding.emergency:
+            self._handlers[binding.emergency.send_id] = self._on_emergency
+        if binding.heartbeat:
+            alive.append(binding.heartbeat)
+        self._alive = {message.send_id for message in alive}
+        self._has_echo = bool(binding.map.echo)
+
+    def _handler(self, incoming: Incoming, bit: int) -> Handler:
+        """What takes one message: a measurement (``bit``), or slow values that are applied when they come."""
+        mark = STATUS if "v_dc" in incoming.parts else 0
+
+        def measure(data: bytes) -> int:
+            flags = incoming.take(data, self._late)
+            if not flags & FRESH:
+                return flags
+            self._got |= bit
+            if self._got != self._needed:
+                return flags & ~FRESH
+            self._got = 0
+            if not self._has_echo:
+                self._echo_cell[0] = self._last_sent
+            return flags
+
+        def status(data: bytes) -> int:
+            flags = incoming.take(data)
+            return flags ^ FRESH | mark if flags & FRESH else flags
+
+        return measure if bit else status
+
+    def _bind(self, tick: Any) -> None:
+        """Reach the fields of this tick record; the loop hands in the same one each time."""
+        translate = translator(self.binding.map.states, lambda: self._last_controlword)
+        for incoming in self._incoming:
+            incoming.cells = [cell_of(tick, name) for name in incoming.fields]
+            if translate is not None and "state" in incoming.parts:
+                place = incoming.parts.index("state")
+                incoming.cells[place] = TranslatedCell(incoming.cells[place], translate)
+        self._flags_cell, self._echo_cell = cell_of(tick, "rx_flags"), cell_of(tick, "echo")
+        self._error_cell = cell_of(tick, "drive_error")
+        self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
+        self._tick = tick
 
     @property
     def command(self) -> Message:
         """The command's message."""
-        return self._command
+        return self.binding.command.message
 
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
         self._late = True
-        self.receive(tick, 0)
-        self._late = False
+        try:
+            self.receive(tick, 0)
+        finally:
+            self._late = False
+            self._got = 0
         self._send_sync()
 
     def _send_sync(self) -> None:
+        sync = self.binding.sync
+        if sync is None:
+            return
         self._sync_counter = self._sync_counter % 240 + 1
-        self._send(self._sync_id, bytes((self._sync_counter,)), False)
+        self._send(sync.send_id, bytes((self._sync_counter,)) if sync.length else b"", False)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
-        """Drain the bus until feedback came or the deadline passed; 0 drains what is there (newest wins)."""
-        flags = self._pending_flags
-        self._pending_flags = 0
-        wait = deadline_ns != 0
+        """Drain the bus until feedback came or the deadline passed; 0 drains what is there (newest wins).
+
+        What is queued when the deadline has passed is still taken, up to a bound that a flood can't exceed.
+        """
+        if tick is not self._tick:
+            self._bind(tick)
+        flags, self._pending_flags = self._pending_flags, 0
+        receive, left, more = self._link.receive, 0, DRAIN_MOST
         try:
-            while True:
-                frame = self._link.receive(max(0, deadline_ns - time.monotonic_ns()) if wait else 0)
+            while more:
+                if deadline_ns and (left := deadline_ns - time.monotonic_ns()) < 0:
+                    left = 0
+                more -= left == 0
+                frame = receive(left)
                 if frame is None:
                     break
-                flags |= self._take(tick, frame)
-                if wait and flags & FRESH:
+                flags |= self._take(frame)
+                if deadline_ns and flags & FRESH:
                     break
         except LinkDown:
             self._down = True
         except LinkError:
             flags |= ERROR_FRAME
-        tick["rx_flags"] = int(tick["rx_flags"]) | flags | (BUS_DOWN if self._down else 0)
+        self._flags_cell[0] = int(self._flags_cell[0]) | flags | (BUS_DOWN if self._down else 0)
 
-    def _take(self, tick: Any, frame: Frame) -> int:
-        """Handle one frame; return its flags."""
-        self.seen[frame.can_id] += 1
-        self._on_frame(True, self._now(), frame.can_id | frame.flags, frame.data)
-        if frame.flags:
-            return ERROR_FRAME if frame.flags & ERR_FLAG else 0
-        if frame.can_id == self.feedback_id:
-            return self._on_feedback(tick, frame)
-        handler = self._handlers.get(frame.can_id)
-        return handler(tick, frame) if handler else 0
+    def _take(self, frame: Frame) -> int:
+        """Handle one frame; return its flags. Remote and error frames match no identifier."""
+        can_id, data, frame_flags, _ = frame
+        if not self._quiet:
+            self._on_frame(True, self._now(), can_id | frame_flags, data)
+        handler = self._handlers.get(can_id | frame_flags)
+        if handler is not None:
+            return handler(data)
+        return ERROR_FRAME if frame_flags & ERR_FLAG else 0
 
-    def _on_feedback(self, tick: Any, frame: Frame) -> int:
-        if len(frame.data) != self._feedback.length:
+    def _on_emergency(self, data: bytes) -> int:
+        """CiA 301: error code first; code 0 says that an error is gone."""
+        if len(data) != 8:
             return LENGTH_ERROR
-        if not self._feedback.valid(frame.data):
-            return CRC_ERROR
-        counter, echo, w, i_q, i_d, state, limited = self._read_feedback(frame.data)
-        last, self._last_counter = self._last_counter, int(counter)
-        if counter == last:
-            return COUNTER_REPEATED
-        if self._late:
-            return 0
-        tick["w"], tick["i_q"], tick["i_d"] = w, i_q, i_d
-        tick["echo"], tick["drive_state"], tick["limited"] = echo, state, limited
-        if self._status_inside:
-            self._apply_status(tick, frame.data)
-        jumped = last >= 0 and counter != (last + 1) % self._counter_modulus
-        return FRESH | (COUNTER_JUMP if jumped else 0)
+        code = data[0] | data[1] << 8
+        self._error_cell[0] = code
+        return EMERGENCY if code else 0
 
-    def _apply_status(self, tick: Any, data: bytes) -> None:
-        v_dc, motor, inverter, error = self._read_status(data)
-        tick["v_dc"], tick["drive_error"] = v_dc, error
-        tick["temperature_motor"], tick["temperature_inverter"] = motor, inverter
-
-    def _on_status(self, tick: Any, frame: Frame) -> int:
-        if len(frame.data) != self._status.length:
-            return LENGTH_ERROR
-        if not self._status.valid(frame.data):
-            return CRC_ERROR
-        self._apply_status(tick, frame.data)
-        return STATUS
-
-    def _on_truth(self, tick: Any, frame: Frame) -> int:
-        if len(frame.data) == 8:
-            tick["T_L_true"] = struct.unpack_from("<f", frame.data)[0]
-        return 0
-
-    def _on_emergency(self, tick: Any, frame: Frame) -> int:
-        if len(frame.data) == 8:
-            tick["drive_error"] = frame.data[0] | frame.data[1] << 8
-        return EMERGENCY
-
-    def _on_foreign(self, tick: Any, frame: Frame) -> int:
+    def _on_foreign(self, data: bytes) -> int:
         return FOREIGN_COMMAND
 
     def send(self, tick: Any) -> None:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
-        self._last_sent = int(tick["counter"])
-        self._send_command(
-            self._last_sent,
-            int(tick["controlword"]),
-            float(tick["u_q"]),
-            float(tick["u_d"]),
-            float(tick["T_L"]),
-        )
+        if tick is not self._tick:
+            self._bind(tick)
+        counter, controlword, u_q, u_d, T_L = (cell[0] for cell in self._sent_cells)
+        self._send_command(int(counter), int(controlword), float(u_q), float(u_d), float(T_L))
 
     def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
-        values = {"Counter": counter, "Controlword": controlword, "VoltageQ": u_q, "VoltageD": u_d}
-        if self._with_load:
-            values |= {"LoadTorque": T_L, "LoadEnable": 1}
-        if self._load is not None:
-            load = self._load.encode({"Counter": counter, "Enable": 1, "LoadTorque": T_L})
-            self._send(self._load.can_id, load, self._load.fd)
-        self._send(self._command.can_id, self._command.encode(values), self._command.fd)
+        """Encode all frames before the first is sent, then send them, the one with u_q last."""
+        enable = controlword == ENABLE_OPERATION
+        reset = controlword & FAULT_RESET != 0
+        values = (controlword, u_q, u_d, T_L, enable, reset, 1)
+        frames = [(out.send_id, out.encode(counter, values), out.fd) for out in self._outgoing]
+        for can_id, data, fd in frames:
+            self._send(can_id, data, fd)
+        self._last_sent, self._last_controlword = counter, controlword
 
     def _send(self, can_id: int, data: bytes, fd: bool) -> None:
         if self._down:
@@ -212,16 +225,19 @@ class DriveClient:
         except LinkError:
             self._pending_flags |= SEND_FAILED
             raise
-        self._on_frame(False, self._now(), can_id, data)
+        if not self._quiet:
+            self._on_frame(False, self._now(), can_id, data)
 
     def stop(self) -> None:
         """Zero voltage and disable, a few times with advancing counters and SYNC; never raises."""
-        modulus = self._command.counter_modulus
+        counter = self._last_sent
         for _ in range(STOP_REPEATS):
-            self._last_sent = (self._last_sent + 1) % modulus
+            counter = (counter + 1) % self.binding.counter_modulus
             try:
-                self._send_command(self._last_sent, 0, 0.0, 0.0, 0.0)
+                self._send_command(counter, 0, 0.0, 0.0, 0.0)
                 self._send_sync()
+            except QueueFull:
+                time.sleep(STOP_PAUSE_S)
             except LinkError:
                 return
 
@@ -240,11 +256,7 @@ class DriveClient:
         end = time.monotonic_ns() + round(timeout_s * 1e9)
         while (left := end - time.monotonic_ns()) > 0:
             frame = self._link.receive(left)
-            if (
-                frame is not None
-                and not frame.flags
-                and frame.can_id in (self.heartbeat_id, self.feedback_id)
-            ):
+            if frame is not None and frame.can_id | frame.flags in self._alive:
                 return True
         return False
 

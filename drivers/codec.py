@@ -5,6 +5,7 @@ A frame is applied whole or not at all; a value that does not fit raises.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,12 @@ class Message:
             raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")
         self.valid, self._protect = make_protection(self.profile, self.length, ids)
         self._writers: dict[tuple[str, ...], Writer] = {}
+
+    def with_signals(self, signals: Mapping[str, Signal]) -> Message:
+        """The same message with some signals in other units."""
+        other = copy.copy(self)
+        other.signals, other._writers = {**self.signals, **signals}, {}
+        return other
 
     @property
     def send_id(self) -> int:

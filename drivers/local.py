@@ -7,7 +7,9 @@ channel's name picks the multicast group, so that buses of different names do no
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
+import ipaddress
 import select
 import socket
 import struct
@@ -18,7 +20,7 @@ from typing import Any
 import can
 
 LOOPBACK = "127.0.0.1"
-PORT = 47113
+FIRST_PORT, PORTS = 16384, 16384  # below the ports that the kernel hands out by itself
 CLASSIC = struct.Struct("=IB3x8s")
 FD = struct.Struct("=IBB2x64s")
 EFF_FLAG, RTR_FLAG, ERR_FLAG = 0x80000000, 0x40000000, 0x20000000
@@ -27,17 +29,31 @@ _SO_ATTACH_FILTER = 26
 _IP_MULTICAST_ALL = 49
 
 
-def group_of(channel: str) -> str:
-    """Multicast group of a channel, in the organisation-local range 239.192.0.0/14."""
+def address_of(channel: str) -> tuple[str, int]:
+    """Multicast group and UDP port of a channel: 32 bits of its name's hash, so that buses do not meet.
+
+    The group is in the organisation-local range 239.192.0.0/14; a channel that is itself a multicast
+    address is taken as the group.
+    """
     digest = zlib.crc32(channel.encode())
-    return f"239.{192 + (digest >> 16 & 3)}.{digest >> 8 & 255}.{digest & 255}"
+    group = f"239.{192 + (digest & 3)}.{digest >> 2 & 255}.{digest >> 10 & 255}"
+    with contextlib.suppress(ValueError):
+        group = str(ipaddress.IPv4Address(channel)) if ipaddress.IPv4Address(channel).is_multicast else group
+    return group, FIRST_PORT + (digest >> 18) % PORTS
 
 
 def pack_frame(can_id: int, data: bytes, fd: bool = False) -> bytes:
     """SocketCAN layout of a data frame; identifiers over 11 bits get the extended flag by the caller."""
+    check_length(data, fd)
     if fd:
-        return FD.pack(can_id, len(data), FD_FDF | FD_BRS, bytes(data))
-    return CLASSIC.pack(can_id, len(data), bytes(data))
+        return FD.pack(can_id, len(data), FD_FDF | FD_BRS, data)
+    return CLASSIC.pack(can_id, len(data), data)
+
+
+def check_length(data: bytes, fd: bool) -> None:
+    """Raise ValueError for what no frame can hold; packing would cut it off without a word."""
+    if len(data) > (64 if fd else 8):
+        raise ValueError(f"{len(data)} bytes do not fit a {'CAN FD' if fd else 'classic CAN'} frame")
 
 
 def _drop_source_port(sock: socket.socket, port: int) -> None:
@@ -55,21 +71,21 @@ def _loopback_index() -> int:
 
 def open_sockets(channel: str, own: bool) -> tuple[socket.socket, socket.socket]:
     """Return (receiving, sending) sockets of a channel. Raises OSError when loopback is down."""
-    group = group_of(channel)
+    group, port = address_of(channel)
     membership = struct.pack("=4s4si", socket.inet_aton(group), socket.inet_aton(LOOPBACK), _loopback_index())
     receiving = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
     sending = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
         receiving.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        receiving.bind((group, PORT))
+        receiving.bind((group, port))
         receiving.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
         receiving.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
         sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, membership)
         sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
         sending.bind((LOOPBACK, 0))
-        sending.connect((group, PORT))
+        sending.connect((group, port))
         if not own:
             _drop_source_port(receiving, sending.getsockname()[1])
     except OSError:
@@ -102,12 +118,18 @@ class LocalBus(can.BusABC):
             raise can.CanInitializationError(
                 f"hil-local: loopback can't be used ({error}); bring it up: ip link set lo up"
             ) from error
-        self.channel_info = f"hil-local channel {self._channel} ({group_of(self._channel)} on lo)"
+        self.channel_info = (
+            f"hil-local channel {self._channel} ({':'.join(map(str, address_of(self._channel)))} on lo)"
+        )
         super().__init__(self._channel, **kwargs)
         self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send one message. Raises CanOperationError."""
+        if msg.is_fd and not self.fd:
+            raise can.CanOperationError(
+                "hil-local: can't send a CAN FD frame: the bus is opened with fd=False"
+            )
         can_id = msg.arbitration_id
         can_id |= EFF_FLAG if msg.is_extended_id else 0
         can_id |= RTR_FLAG if msg.is_remote_frame else 0
@@ -125,12 +147,14 @@ class LocalBus(can.BusABC):
             raise can.CanOperationError(f"hil-local: can't send: {error}", error.errno) from error
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        if not select.select([self.receiving], [], [], timeout)[0]:
-            return None, False
         try:
+            if not select.select([self.receiving], [], [], timeout)[0]:
+                return None, False
             raw = self.receiving.recv(128)
         except BlockingIOError:
             return None, False
+        except (OSError, ValueError) as error:
+            raise can.CanOperationError(f"hil-local: can't receive: {error}") from error
         return self._message(raw), False
 
     def _message(self, raw: bytes) -> can.Message | None:
@@ -138,6 +162,8 @@ class LocalBus(can.BusABC):
         if len(raw) not in (CLASSIC.size, FD.size):
             return None
         fd = len(raw) == FD.size
+        if fd and not self.fd:
+            return None
         can_id, length, flags, data = FD.unpack(raw) if fd else (*CLASSIC.unpack(raw)[:2], 0, raw[8:])
         if length > (64 if fd else 8):
             return None

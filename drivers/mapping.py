@@ -1,0 +1,181 @@
+"""Which frame and signal of a DBC plays which part: how any drive is driven by the same client.
+
+A map names ``MESSAGE.Signal`` for each part; scale and offset are the DBC's, units are converted here and
+nowhere else. Binding a map to a DBC checks it whole, and names all mistakes at once.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from drivers.codec import Database
+from drivers.errors import DatabaseError
+
+SPEED: Final = {"rad/s": 1.0, "rpm": math.pi / 30, "1/min": math.pi / 30, "deg/s": math.pi / 180}
+CURRENT: Final = {"A": 1.0, "mA": 1e-3}
+VOLTAGE: Final = {"V": 1.0, "mV": 1e-3}
+CELSIUS: Final = {"degC": 1.0, "C": 1.0, "°C": 1.0}
+TORQUE: Final = {"N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mNm": 1e-3}
+PLAIN: Final[dict[str, float]] = {}
+STATUSWORD: Final = "statusword"
+OFF: Final = -1
+STATES: Final = {
+    "not ready to switch on": 0,
+    "switch on disabled": 1,
+    "ready to switch on": 2,
+    "switched on": 3,
+    "operation enabled": 4,
+    "quick stop active": 5,
+    "fault reaction active": 6,
+    "fault": 7,
+    "off": OFF,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What a part is: the tick's field, accepted units with their factor to SI, and whether it has a sign."""
+
+    field: str
+    units: Mapping[str, float]
+    signed: bool = False
+
+
+RECEIVED: Final[dict[str, Part]] = {
+    "speed": Part("w", SPEED, True),
+    "i_q": Part("i_q", CURRENT, True),
+    "i_d": Part("i_d", CURRENT, True),
+    "echo": Part("echo", PLAIN),
+    "state": Part("drive_state", PLAIN),
+    "limited": Part("limited", PLAIN),
+    "v_dc": Part("v_dc", VOLTAGE),
+    "error": Part("drive_error", PLAIN),
+    "temperature_motor": Part("temperature_motor", CELSIUS),
+    "temperature_inverter": Part("temperature_inverter", CELSIUS),
+    "load_true": Part("T_L_true", TORQUE, True),
+}
+SENT: Final[dict[str, Part]] = {
+    "controlword": Part("controlword", PLAIN),
+    "enable": Part("", PLAIN),
+    "reset": Part("", PLAIN),
+    "u_q": Part("u_q", VOLTAGE, True),
+    "u_d": Part("u_d", VOLTAGE, True),
+    "load_torque": Part("T_L", TORQUE, True),
+    "load_enable": Part("", PLAIN),
+}
+MEASURED: Final = ("speed", "i_q", "i_d")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriveMap:
+    """A drive's parts as ``MESSAGE.Signal``; ``sync``, ``emergency`` and ``heartbeat`` name messages.
+
+    An empty part is not there. ``counters``: the frame counter of each message that has one. ``constants``:
+    signals that are always sent with a value. ``states``: CiA 402's name for each raw value of ``state``, or
+    "statusword" to decode CiA 402's; empty when the values are hil's own. A state named "off" reads as what
+    the last controlword leads to short of operation, for drives that know only on and off.
+    """
+
+    speed: str
+    i_q: str
+    i_d: str
+    state: str
+    u_q: str
+    u_d: str
+    controlword: str = ""
+    enable: str = ""
+    reset: str = ""
+    echo: str = ""
+    limited: str = ""
+    v_dc: str = ""
+    error: str = ""
+    temperature_motor: str = ""
+    temperature_inverter: str = ""
+    load_true: str = ""
+    load_torque: str = ""
+    load_enable: str = ""
+    sync: str = ""
+    emergency: str = ""
+    heartbeat: str = ""
+    counters: tuple[str, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
+    states: Mapping[int, str] | str = field(default_factory=dict)
+
+
+def house_map(database: Database) -> DriveMap:
+    """The map of the house protocol, classic or FD. Raises DatabaseError when the DBC is another one."""
+    status = "FEEDBACK" if database.optional("STATUS") is None else "STATUS"
+    load = "COMMAND" if database.optional("LOAD_COMMAND") is None else "LOAD_COMMAND"
+    counted = dict.fromkeys(("FEEDBACK", "COMMAND", status, load))
+    truth, emergency, heartbeat = (
+        name if database.optional(name) else "" for name in ("TRUTH", "EMCY", "HEARTBEAT")
+    )
+    return DriveMap(
+        speed="FEEDBACK.Speed",
+        i_q="FEEDBACK.CurrentQ",
+        i_d="FEEDBACK.CurrentD",
+        state="FEEDBACK.State",
+        echo="FEEDBACK.Echo",
+        limited="FEEDBACK.Limited",
+        v_dc=f"{status}.DcLinkVoltage",
+        error=f"{status}.ErrorCode",
+        temperature_motor=f"{status}.TemperatureMotor",
+        temperature_inverter=f"{status}.TemperatureInverter",
+        load_true="TRUTH.LoadTorqueTrue" if truth else "",
+        controlword="COMMAND.Controlword",
+        u_q="COMMAND.VoltageQ",
+        u_d="COMMAND.VoltageD",
+        load_torque=f"{load}.LoadTorque",
+        load_enable="COMMAND.LoadEnable" if load == "COMMAND" else "LOAD_COMMAND.Enable",
+        counters=tuple(f"{name}.Counter" for name in counted),
+        sync="SYNC",
+        emergency=emergency,
+        heartbeat=heartbeat,
+    )
+
+
+def map_from_table(table: Mapping[str, Any], where: str) -> DriveMap:
+    """A map from a config's ``[drive.signals]``. Raises DatabaseError that names all mistakes."""
+    fields = {one.name: one for one in dataclasses.fields(DriveMap)}
+    mistakes = [f"{key}: unknown; known are {', '.join(fields)}" for key in table if key not in fields]
+    required = [name for name, one in fields.items() if _is_required(one)]
+    mistakes += [f'{name}: missing; name it as "MESSAGE.Signal"' for name in required if name not in table]
+    values: dict[str, Any] = {}
+    for key in table.keys() & fields.keys():
+        value = _value(key, table[key])
+        if value is None:
+            mistakes.append(f"{key}: {table[key]!r} is not of the form that it takes")
+        values[key] = value
+    if mistakes:
+        raise DatabaseError(f"{where}: " + "; ".join(sorted(mistakes)))
+    return DriveMap(**values)
+
+
+def _is_required(one: Any) -> bool:
+    return one.default is dataclasses.MISSING and one.default_factory is dataclasses.MISSING
+
+
+def _value(key: str, value: Any) -> Any:
+    """The value of one key in the map's type, None when it has another form."""
+    if key == "counters":
+        texts = isinstance(value, list | tuple) and all(isinstance(one, str) for one in value)
+        return tuple(value) if texts else None
+    if key == "states":
+        if value == STATUSWORD:
+            return value
+        return _states(value) if isinstance(value, Mapping) else None
+    if key == "constants":
+        numbers = isinstance(value, Mapping) and all(isinstance(v, int | float) for v in value.values())
+        return {str(name): float(number) for name, number in value.items()} if numbers else None
+    return value if isinstance(value, str) else None
+
+
+def _states(value: Mapping[Any, Any]) -> dict[int, str] | None:
+    try:
+        return {int(raw): str(name) for raw, name in value.items()}
+    except (TypeError, ValueError):
+        return None
