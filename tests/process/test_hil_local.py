@@ -150,7 +150,8 @@ def test_no_frame_leaves_the_machine() -> None:
     """A default route for multicast over another interface is there; nothing may take it."""
     setup = (
         "ip link set lo up", "ip link add v0 type veth peer name v1", "ip addr add 10.9.8.1/24 dev v0",
-        "ip link set v0 up", "ip link set v1 up", "ip route add 224.0.0.0/4 dev v0", "ip route add default dev v0",
+        "ip link set v0 up", "ip link set v1 up",
+        "ip route add 224.0.0.0/4 dev v0", "ip route add default dev v0",
     )  # fmt: skip
     done = in_namespace(LEAK, *setup)
     here, away = map(int, done.stdout.split())
