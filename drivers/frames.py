@@ -52,7 +52,7 @@ class Incoming:
         self.cells: list[Cell] = []
 
     def take(self, data: bytes, late: bool = False) -> int:
-        """Check a frame; set the fields and return FRESH among the flags if it is whole, valid, new, not late."""
+        """Check a frame; if it is whole, valid, new and not late set the fields and flag FRESH too."""
         if len(data) != self.length:
             return LENGTH_ERROR
         if not self.valid(data):
