@@ -197,6 +197,12 @@ class DriveClient:
     def _on_foreign(self, data: bytes) -> int:
         return FOREIGN_COMMAND
 
+    def warm_up(self, tick: Any) -> None:
+        """Bind and encode once without sending, so that the first tick is like the others."""
+        self._bind(tick)
+        for out in self._outgoing:
+            out.encode(0, (0, 0.0, 0.0, 0.0, False, False, 1))
+
     def send(self, tick: Any) -> None:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:

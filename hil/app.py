@@ -216,6 +216,7 @@ def opened_client(
         on_frame=watch.chained(on_frame) if watch else on_frame,
         now=clock.now_ns,
     )
+    client.warm_up(new_ticks()[0])
     try:
         yield client
     finally:

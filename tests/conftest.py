@@ -15,7 +15,7 @@ CONFIGS = ROOT / "configs"
 
 @pytest.fixture
 def configs(tmp_path: Path) -> Path:
-    """The shipped configurations, the demo's drive patient with a busy host (contract tests hold the 20 ms)."""
+    """The shipped configurations, the demo's drive patient with a busy host."""
     copy = tmp_path / "configs"
     shutil.copytree(CONFIGS, copy)
     with (copy / "plants" / "demo.toml").open("a", encoding="utf-8") as plant:
