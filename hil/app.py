@@ -169,6 +169,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
     attachments = {
         "config.toml": setup.path.read_text(encoding="utf-8"),
         "config.json": setup.config.model_dump_json(),
+        "controller.json": setup.machine.to_json(),
         "drive.dbc": setup.database.text,
     }
     if setup.config.emulator is not None:

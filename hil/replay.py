@@ -90,7 +90,11 @@ def machine_of(log: Log) -> Machine:
         )
     except (KeyError, ValueError, TypeError) as error:
         raise HilError(f"{log.path}: has no usable config in it ({error})") from error
-    return build(validate(config, RunConfig, f"{log.path}: config.json", log.path.parent), facts)
+    machine = build(validate(config, RunConfig, f"{log.path}: config.json", log.path.parent), facts)
+    try:
+        return machine.with_parameters(log.attachments["controller.json"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise HilError(f"{log.path}: has no usable parameters in it ({error})") from error
 
 
 def replayed(machine: Machine, logged: TickArray) -> TickArray:
