@@ -20,6 +20,7 @@ from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
 from hil.config import load_toml
+from tests.conftest import CONFIGS
 
 COMMAND_IDS = bytes.fromhex("395C9840D9E9D87342086F2736513DF8")
 LOAD_IDS = bytes.fromhex("A19FBD41309BCACD6BE58B2B3F29A5D8")
@@ -60,6 +61,12 @@ class Wires:
 
     def close(self) -> None:
         pass
+
+
+@pytest.fixture
+def configs() -> Path:
+    """The shipped drive itself, with its watchdog of 20 ms."""
+    return CONFIGS
 
 
 class Bench:
