@@ -118,8 +118,12 @@ class SocketLink:
 
     def close(self) -> None:
         """Close the bus."""
-        self._fds = [-1]
+        self._fds, self._poll = [-1], _closed  # their number may be another file's by the next call
         self._bus.shutdown()
+
+
+def _closed(timeout: float | None = None, /) -> list[tuple[int, int]]:
+    raise ValueError("closed")
 
 
 def _discard(link: Link) -> int:

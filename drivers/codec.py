@@ -151,7 +151,7 @@ class Database:
         self.unusable: dict[str, str] = {}
         for one in parsed.messages:
             try:
-                self.messages[one.name] = Message(one, _shifted(one.frame_id, node_id), str(path))
+                self.messages[one.name] = Message(one, _identifier(one, node_id), str(path))
             except DatabaseError as error:
                 self.unusable[one.name] = str(error)
 
@@ -188,8 +188,9 @@ def _first_line(error: Exception) -> str:
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
 
 
-def _shifted(frame_id: int, node_id: int) -> int:
-    """CANopen: the low seven bits are the node; 0 there (SYNC) is for all and stays."""
-    if frame_id > 0x7FF or frame_id & _NODE_BITS == 0:
+def _identifier(parsed: Any, node_id: int) -> int:
+    """CANopen: the low seven of eleven bits are the node; 0 there (SYNC) is for all and stays."""
+    frame_id = int(parsed.frame_id)
+    if parsed.is_extended_frame or frame_id & _NODE_BITS == 0:
         return frame_id
     return frame_id - 1 + node_id

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import pty
 import select
@@ -121,11 +122,14 @@ def test_too_long_a_frame_is_refused(pair: tuple[Link, Link], size: int, fd: boo
 def test_a_closed_link_is_down(channel: str) -> None:
     link = open_link(BusSettings("hil-local", channel))
     link.close()
+    reused = [os.pipe() for _ in range(4)]  # take over the descriptors that the link had
     with pytest.raises(LinkDown):
         link.send(1, b"")
     for timeout in (0, 1000):
         with pytest.raises(LinkDown):
             link.receive(timeout)
+    for descriptor in itertools.chain(*reused):
+        os.close(descriptor)
 
 
 def test_buses_of_other_names_do_not_meet(channel: str) -> None:
@@ -141,6 +145,7 @@ def test_buses_of_other_names_do_not_meet(channel: str) -> None:
 def test_addresses_are_multicast_stable_and_spread() -> None:
     addresses = {address_of(f"bus {number}") for number in range(2000)}
     assert len(addresses) == 2000
+    assert len({port for _, port in addresses}) > 1000
     assert all(group.startswith("239.") and 16384 <= port < 32768 for group, port in addresses)
     assert address_of("239.7.8.9")[0] == "239.7.8.9"
 
@@ -291,6 +296,9 @@ group, port = address_of("ns")
 for number in range(20):
     one.send(number, b"HILFRAME")
 got = sum(other.receive(1_000_000_000) is not None for _ in range(20))
+joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+membership = socket.inet_aton(group) + socket.inet_aton("10.9.8.1")
+joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
 stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton("10.9.8.1"))
 stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)

@@ -299,3 +299,4 @@ def test_both_byte_orders_in_one_message(tmp_path: Path) -> None:
     assert message.encode({"A": 1, "B": -2, "C": -3}) == bytes.fromhex("01 FFFE FD")
     assert message.decode(bytes.fromhex("01 FFFE FD")) == {"A": 1, "B": -2, "C": -3}
     assert message.extended and message.can_id == 513 and message.send_id == 513 | 0x80000000
+    assert Database(path, node_id=5).message("M").can_id == 513, "only CANopen's 11-bit identifiers move"

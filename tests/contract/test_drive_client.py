@@ -83,6 +83,15 @@ def test_a_dict_serves_as_well_as_a_record(bench: Bench) -> None:
     assert plain["w"] == 2.0 and plain["rx_flags"] == RxFlag.FRESH
 
 
+def test_one_record_of_many(bench: Bench) -> None:
+    ticks = new_ticks().repeat(3)
+    untouched = ticks[0].tobytes()
+    bench.feed("FEEDBACK", Counter=1, Speed=2.0)
+    bench.client.receive(ticks[1], time.monotonic_ns() + 10**9)
+    assert ticks["w"].tolist() == [0.0, 2.0, 0.0]
+    assert ticks[0].tobytes() == ticks[2].tobytes() == untouched
+
+
 def test_only_named_fields_change(bench: Bench) -> None:
     before = bench.ticks.tobytes()
     bench.feed("FEEDBACK", Counter=1, Speed=2.0)

@@ -207,6 +207,7 @@ def test_the_binding_tells_steps_in_si(database: Database, other: DriveMap) -> N
     speed, i_q, u_q = (binding.signal(part) for part in ("speed", "i_q", "u_q"))
     assert speed and i_q and u_q
     assert (speed.scale, i_q.scale, u_q.scale) == pytest.approx((0.5 * math.pi / 30, 0.01, 1e-4))
+    assert (speed.minimum, speed.maximum) == pytest.approx((-16000 * math.pi / 30, 16000 * math.pi / 30))
     assert u_q.top == 400.0 and binding.counter_modulus == 16 and binding.signal("echo") is None
 
 
