@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import select
 import socket
-import time
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -220,8 +219,3 @@ def open_link(settings: BusSettings) -> Link:
     if settings.interface == "socketcan":
         return SocketLink(bus, bus.socket, bus.socket, settings.fd)  # type: ignore[attr-defined]
     return GenericLink(bus)
-
-
-def monotonic_deadline(timeout_s: float) -> int:
-    """Absolute monotonic deadline [ns]."""
-    return time.monotonic_ns() + round(timeout_s * 1e9)

@@ -9,15 +9,14 @@ import platform
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from drivers.bus import BusSettings, Link, open_link
+from drivers.bus import BusSettings, open_link
 from drivers.client import DriveClient, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
@@ -330,24 +329,3 @@ def stopping_on_signals(request: StopRequest) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def with_clock(setup: Setup, clock: str) -> Setup:
-    """The same setup on another clock."""
-    loop = setup.config.loop.model_copy(update={"clock": clock})
-    return replace(setup, config=setup.config.model_copy(update={"loop": loop}))
-
-
-def wait_until(predicate: Any, timeout_s: float) -> bool:
-    """Poll ``predicate`` every 10 ms."""
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
-        if predicate():
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def open_bus(config: RunConfig) -> Link:
-    """The configured bus as a raw link."""
-    return open_link(bus_settings(config))
