@@ -1,0 +1,1 @@
+"""The subcommands of ``hil``, one module each; heavy imports only inside a command that runs."""

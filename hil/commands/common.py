@@ -1,0 +1,80 @@
+"""What the commands share: python-can's bus flags, overrides, and the two ways to print a result."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hil.app import Overrides
+
+EXIT_FAILED, EXIT_REFUSED = 1, 2
+Run = Callable[[argparse.Namespace], int]
+
+
+class Commands:
+    """The subcommands of ``hil``; each module of this package adds its own."""
+
+    def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self._commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(self, name: str, run: Run, text: str) -> argparse.ArgumentParser:
+        """Add one command with its ``--json`` flag and return its parser."""
+        command = self._commands.add_parser(name, help=text, description=text)
+        command.set_defaults(run=run)
+        command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
+        return command
+
+
+def bus_flags(parser: argparse.ArgumentParser) -> None:
+    """python-can's own flags, on top of the config."""
+    group = parser.add_argument_group("bus (as python-can; they override the config)")
+    group.add_argument("-i", "--interface", help="python-can interface: hil-local, socketcan, ...")
+    group.add_argument("-c", "--channel", help="channel: any name for hil-local, vcan0 or can0 for socketcan")
+    group.add_argument("-b", "--bitrate", type=int, help="bitrate [bit/s]")
+    group.add_argument("--fd", action="store_true", help="CAN FD")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="override a config key, e.g. loop.rate_hz=500",
+    )
+
+
+def overrides(args: argparse.Namespace) -> Overrides:
+    """Overrides from the flags of a command."""
+    from hil.app import Overrides
+
+    settings = list(args.set)
+    if getattr(args, "lockstep", False):
+        settings.append('loop.clock="lockstep"')
+    if getattr(args, "shadow", False):
+        settings.append("loop.shadow=true")
+    if getattr(args, "duration", None) is not None:
+        settings.append(f"loop.duration_s={float(args.duration)}")
+    return Overrides(args.interface, args.channel, args.bitrate, args.fd, tuple(settings))
+
+
+def print_json(value: Any) -> None:
+    """Print ``value`` as JSON on standard output."""
+    print(json.dumps(_finite(value), indent=2, allow_nan=False))  # noqa: T201
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN and no infinity: they become null."""
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):
+        return None
+    return value
+
+
+def say(text: str) -> None:
+    """Print a line on standard error."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201

@@ -1,0 +1,54 @@
+"""``hil emulate`` and ``hil simulate``: the emulated drive, on a bus or without one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json
+
+
+def register(commands: Commands) -> None:
+    """Add what this module offers."""
+    command = commands.add("emulate", cmd_emulate, "Serve the emulated drive that CONFIG names until Ctrl-C.")
+    command.add_argument(
+        "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"
+    )
+    command.add_argument("--lockstep", action="store_true", help="advance by one period a SYNC")
+    command.add_argument(
+        "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
+    )
+    bus_flags(command)
+    command = commands.add(
+        "simulate", cmd_simulate, "Run controller and emulated motor in one process without a bus."
+    )
+    command.add_argument(
+        "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"
+    )
+    command.add_argument("--duration", type=float, metavar="S", help="simulate S seconds")
+    command.add_argument(
+        "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
+    )
+    bus_flags(command)
+
+
+def cmd_emulate(args: argparse.Namespace) -> int:
+    """Serve the emulated drive until stopped."""
+    from hil.emulate import serve
+
+    serve(args.config, overrides(args), args.plant_set)
+    return 0
+
+
+def cmd_simulate(args: argparse.Namespace) -> int:
+    """Simulate a config."""
+    from hil.app import load_setup
+    from hil.simulate import simulate
+    from hil.view import key_values, show
+
+    result = simulate(load_setup(args.config, overrides(args)), args.plant_set)
+    if args.json:
+        print_json(result)
+    else:
+        show(key_values("simulation", result))
+    return 0 if result["ok"] else EXIT_FAILED

@@ -1,0 +1,68 @@
+"""``hil run`` and ``hil check``: the controller on a bus."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
+
+
+def register(commands: Commands) -> None:
+    """Add what this module offers."""
+    command = commands.add(
+        "run", cmd_run, "Close the loop on the bus of CONFIG. Sends nothing before the drive was armed."
+    )
+    command.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
+    command.add_argument("--arm", action="store_true", help="allow voltage on a bus that is not emulated")
+    command.add_argument("--yes", action="store_true", help="with --arm: do not ask on the terminal")
+    command.add_argument(
+        "--shadow", action="store_true", help="read and compute, send nothing, not even SYNC"
+    )
+    command.add_argument(
+        "--dead-man",
+        action="store_true",
+        help="stop when standard input closes or, on a terminal, when no key is held for a second",
+    )
+    command.add_argument("--duration", type=float, metavar="S", help="stop after S seconds")
+    command.add_argument("--lockstep", action="store_true", help="the emulator advances by one period a SYNC")
+    bus_flags(command)
+    command = commands.add(
+        "check", cmd_check, "Check interface, drive, limits, bus load and rights. Sends nothing."
+    )
+    command.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
+    bus_flags(command)
+
+
+def cmd_run(args: argparse.Namespace) -> int:
+    """Run a config on its bus."""
+    from hil.app import check_arming, is_emulated_bus, load_setup, run
+    from hil.arming import confirm, requesting
+    from hil.view import run_table, show
+
+    setup = load_setup(args.config, overrides(args))
+    check_arming(setup, args.arm)
+    if not (args.yes or args.shadow or is_emulated_bus(setup.config)):
+        confirm(setup.config, sys.stdin, sys.stderr)
+    with requesting(args.dead_man, sys.stdin, say) as request:
+        result = run(setup, arm=args.arm, request=request)
+    if args.json:
+        print_json(result.as_dict())
+    else:
+        show(run_table(result))
+    return 0 if result.ok else EXIT_FAILED
+
+
+def cmd_check(args: argparse.Namespace) -> int:
+    """Check everything before arming."""
+    from hil.app import load_setup
+    from hil.check import check, check_table, passed
+    from hil.view import show
+
+    rows = check(load_setup(args.config, overrides(args)))
+    if args.json:
+        print_json({"rows": [row.as_dict() for row in rows]})
+    else:
+        show(check_table(rows))
+    return 0 if passed(rows) else EXIT_FAILED
