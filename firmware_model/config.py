@@ -138,7 +138,7 @@ class PlantConfig(Table):
     dbc: str
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     pacing: Literal["sync", "cyclic"] = "sync"
-    substep_us: Annotated[int, Field(ge=1)] = 100
+    substep_us: Annotated[int, Field(ge=1)] = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
     truth: bool = True
     motor: Annotated[PlantMotor, BeforeValidator(included)]
@@ -214,6 +214,8 @@ def build_params(config: PlantConfig, wire: Wire) -> Record:
         p[name] = value
     for j, load in enumerate(config.load):
         p["load_kind"][0, j], p["load_a"][0, j], p["load_b"][0, j], p["load_c"][0, j] = _load_row(load)
+    p["loads"] = len(config.load)
+    p["varying"] = int((p["load_kind"] > LoadKind.STEP).any())
     return p
 
 

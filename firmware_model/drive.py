@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from firmware_model.jit import jit
-from firmware_model.load import load_torque
-from firmware_model.motor import rk4
+from firmware_model.load import edge_after, load_torque
+from firmware_model.motor import move
 from firmware_model.plant import ErrorCode, State
 from firmware_model.sensors import measure, whole_degrees
 
@@ -71,13 +71,17 @@ def heat(p: Any, s: Any, h: float) -> None:
 
 @jit
 def advance(p: Any, s: Any, dt_ns: int) -> None:
-    """Move plant time on by dt_ns in substeps of at most substep_ns."""
+    """Move plant time on by dt_ns in substeps of at most substep_ns that end at the edges of step loads."""
     left = dt_ns
+    edge = edge_after(p, s["t_ns"])
     while left > 0:
         step = min(left, p["substep_ns"])
+        if edge < s["t_ns"] + step:
+            step = max(int(np.rint(edge)) - s["t_ns"], 1)
+            edge = edge_after(p, s["t_ns"] + step)
         h = step * 1e-9
         on = s["state"] == State.OPERATION_ENABLED
-        rk4(p, s["x"], s["t_ns"] * 1e-9, h, s["u_q"], s["u_d"], s["T_commanded"], on)
+        move(p, s["x"], s["series"], s["t_ns"] * 1e-9, h, s["u_q"], s["u_d"], s["T_commanded"], on)
         s["t_ns"] += step
         left -= step
         protect(p, s)  # first, so that no absurd current heats the motor

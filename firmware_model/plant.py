@@ -11,6 +11,8 @@ from typing import Final
 import numpy as np
 
 MAX_LOADS: Final = 8
+ORDER: Final = 8
+"""Order of the motor's Taylor series."""
 
 
 class State(IntEnum):
@@ -81,6 +83,8 @@ PARAMS: Final = np.dtype(
         ("thermal_time", "f8"),
         ("status_every", "i8"),
         ("seed", "i8"),
+        ("loads", "i8"),
+        ("varying", "i8"),
         ("load_kind", "i8", MAX_LOADS),
         ("load_a", "f8", MAX_LOADS),
         ("load_b", "f8", MAX_LOADS),
@@ -98,6 +102,7 @@ coupler (T_max, slip at T_max, speed of the other side).
 STATE: Final = np.dtype(
     [
         ("x", "f8", 3),
+        ("series", "f8", (3 + MAX_LOADS, ORDER + 1)),
         ("t_ns", "i8"),
         ("started", "i8"),
         ("u_q", "f8"),
@@ -123,7 +128,9 @@ STATE: Final = np.dtype(
     ],
     align=True,
 )
-"""x = (w, i_q, i_d); plant time from the first SYNC; latched and pending command; CiA 402 state."""
+"""x = (w, i_q, i_d), room for its series and those of the loads; plant time from the first SYNC;
+latched and pending command; CiA 402 state.
+"""
 
 SAMPLE: Final = np.dtype(
     [

@@ -29,7 +29,7 @@ from hil.loop import transition_event
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 
 Record = npt.NDArray[np.void]
-BLOCK: Final = 4096
+BLOCK: Final = 1024
 
 
 @jit
@@ -112,11 +112,13 @@ class Simulation:
     stop_at: int
 
     def blocks(self) -> Any:
-        """Yield tick arrays of up to BLOCK ticks until the run has ended."""
+        """Yield tick arrays of up to BLOCK ticks until the run has ended; each is overwritten by the next."""
         machine, tick, out, k = self.setup.machine.fresh(), new_ticks(), new_sample(), 0
         period_ns = self.setup.config.loop.period_ns
+        ticks = new_ticks(
+            BLOCK
+        )  # one for all: fresh pages for each block would cost more than the control law
         while True:
-            ticks = new_ticks(BLOCK)
             count = simulate_block(
                 machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
                 self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
@@ -145,7 +147,7 @@ def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
 
 def simulate_ticks(setup: Setup, plant_settings: list[str] | None = None) -> TickArray:
     """The whole simulated run in memory, without a log."""
-    return np.concatenate(list(make_simulation(setup, plant_settings or []).blocks()))
+    return np.concatenate([ticks.copy() for ticks in make_simulation(setup, plant_settings or []).blocks()])
 
 
 def simulate(setup: Setup, plant_settings: list[str]) -> dict[str, Any]:
