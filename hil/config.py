@@ -312,7 +312,7 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
     """
     data = read_toml(path)
     for override in overrides:
-        _apply_override(data, override)
+        _apply_override(data, override, path.parent)
     return validate(data, model, str(path), path.parent)
 
 
@@ -325,8 +325,11 @@ def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path
         raise ConfigError(where, problems) from None
 
 
-def _apply_override(data: dict[str, Any], override: str) -> None:
-    """Set one ``table.key=value``; a value that is not TOML is taken as a string."""
+def _apply_override(data: dict[str, Any], override: str, base: Path) -> None:
+    """Set one ``table.key=value``; a value that is not TOML is taken as a string.
+
+    A table that is given as the path of a file is read first, so that one key of it can be changed.
+    """
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
         raise ConfigError("--set", [f"{override!r} is not of the form table.key=value"])
@@ -336,6 +339,8 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
         value = text
     *tables, last = key.strip().split(".")
     for name in tables:
+        if isinstance(data.get(name), str) and data[name].endswith(".toml"):
+            data[name] = read_toml(base / data[name])
         data = data.setdefault(name, {})
         if not isinstance(data, dict):
             raise ConfigError("--set", [f"{override!r}: {name} is not a table"])

@@ -6,6 +6,8 @@ A pure fold: same inputs, same config, same code. Exit codes: 0 same, 1 differs,
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +20,7 @@ from hil.control.jit import jit
 from hil.design import Machine, WireFacts, build
 from hil.errors import HilError
 from hil.kernel import step
-from hil.log.reader import Log, open_log
+from hil.log.reader import Log, LogError, read_blocks
 from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
 
 _KINDS = {field.name: field.kind for field in FIELDS}
@@ -80,32 +82,48 @@ def fold(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
         step(sp, ss, lp, ls, ticks[j : j + 1])
 
 
+def wire_of_log(log: Log) -> WireFacts:
+    """The wire facts in a log's metadata. Raises HilError."""
+    try:
+        wire = json.loads(log.metadata["run"]["wire"])
+        lsb = tuple(wire["x_lsb"])
+        return WireFacts(wire["u_lsb"], wire["T_L_lsb"], wire["counter_modulus"], lsb, wire["u_top"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise HilError(f"{log.path}: has no usable wire facts in it ({error})") from error
+
+
 def machine_of(log: Log) -> Machine:
     """The controller that wrote a log, from the config and the wire facts in it. Raises HilError."""
     try:
         config = json.loads(log.attachments["config.json"])
-        wire = json.loads(log.metadata["run"]["wire"])
-        facts = WireFacts(
-            wire["u_lsb"], wire["T_L_lsb"], wire["counter_modulus"], tuple(wire["x_lsb"]), wire["u_top"]
-        )
     except (KeyError, ValueError, TypeError) as error:
         raise HilError(f"{log.path}: has no usable config in it ({error})") from error
-    machine = build(validate(config, RunConfig, f"{log.path}: config.json", log.path.parent), facts)
+    where = f"{log.path}: config.json"
+    machine = build(validate(config, RunConfig, where, log.path.parent), wire_of_log(log))
     try:
         return machine.with_parameters(log.attachments["controller.json"])
     except (KeyError, ValueError, TypeError) as error:
         raise HilError(f"{log.path}: has no usable parameters in it ({error})") from error
 
 
-def replayed(machine: Machine, logged: TickArray) -> TickArray:
-    """The logged ticks with every output computed anew from the inputs."""
-    ticks = new_ticks(len(logged))
+def set_inputs(ticks: TickArray, logged: TickArray) -> None:
+    """Copy times and inputs of the logged ticks; every output is left to be computed."""
     for field in FIELDS:
         if field.role == "time" or field.name in INPUTS:
             ticks[field.name] = logged[field.name]
-    own = machine.fresh()
-    fold(own.safety, own.safety_state, own.law, own.law_state, ticks)
+
+
+def refold(machine: Machine, logged: TickArray) -> TickArray:
+    """The ticks with every output computed anew; ``machine`` keeps its state for the ticks that follow."""
+    ticks = new_ticks(len(logged))
+    set_inputs(ticks, logged)
+    fold(machine.safety, machine.safety_state, machine.law, machine.law_state, ticks)
     return ticks
+
+
+def replayed(machine: Machine, logged: TickArray) -> TickArray:
+    """A whole run computed anew from its first tick on."""
+    return refold(machine.fresh(), logged)
 
 
 def bits(values: npt.NDArray[Any], kind: str) -> npt.NDArray[np.int64]:
@@ -133,30 +151,114 @@ def compare(logged: TickArray, again: TickArray) -> Difference | None:
     return Difference(int(logged["k"][row]), name, float(ours[0]), float(theirs[0]), ulp)
 
 
+@dataclass(frozen=True, slots=True)
+class Window:
+    """The part of a run that is compared [s from its first tick]; the fold itself begins at the start."""
+
+    start_s: float = 0.0
+    end_s: float = math.inf
+
+    def of(self, ticks: TickArray, first_ns: int) -> TickArray:
+        """The ticks inside."""
+        at = (ticks["t_ns"] - np.uint64(first_ns)) * 1e-9
+        inside: TickArray = ticks[(at >= self.start_s) & (at <= self.end_s)]
+        return inside
+
+
+@dataclass(slots=True)
+class _Replay:
+    """One pass over a log's ticks, block by block; memory holds one block."""
+
+    log: Log
+    window: Window
+    machine: Machine | None = None
+    first_ns: int = 0
+    last_k: int = -1
+    ticks: int = 0
+    compared: int = 0
+    why: str = ""
+    difference: Difference | None = None
+
+    def begin(self, ticks: TickArray) -> bool:
+        """Design the controller at the first tick; False when the run's beginning is missing."""
+        self.first_ns, self.last_k = int(ticks["t_ns"][0]), int(ticks["k"][0]) - int(ticks["gap"][0])
+        if int(ticks["k"][0]) != 0:
+            self.why = f"the log begins at tick {int(ticks['k'][0])}; its beginning is missing"
+            return False
+        self.machine = machine_of(self.log).fresh()
+        return True
+
+    def take(self, ticks: TickArray) -> bool:
+        """Fold and compare a block; False when there is no more to learn."""
+        if self.machine is None and not self.begin(ticks):
+            return False
+        assert self.machine is not None  # noqa: S101 - begin made it
+        whole = self._before_gap(ticks)
+        if len(whole):
+            again = refold(self.machine, whole)
+            logged = self.window.of(whole, self.first_ns)
+            self.difference = compare(logged, self.window.of(again, self.first_ns))
+            self.ticks, self.compared = self.ticks + len(whole), self.compared + len(logged)
+            self.last_k = int(whole["k"][-1])
+        past = len(whole) > 0 and (int(whole["t_ns"][-1]) - self.first_ns) * 1e-9 > self.window.end_s
+        return len(whole) == len(ticks) and self.difference is None and not past
+
+    def _before_gap(self, ticks: TickArray) -> TickArray:
+        """The ticks before the first that the loop ran and the log lacks; skipped periods are none."""
+        k = ticks["k"].astype(np.int64)
+        missing = np.diff(k, prepend=self.last_k) - ticks["gap"]
+        at = np.nonzero(missing)[0]
+        if not len(at):
+            return ticks
+        row = int(at[0])
+        before = int(k[row - 1]) if row else self.last_k
+        self.why = (
+            f"same up to tick {before}, then {int(missing[row])} records are missing before tick {k[row]}"
+        )
+        return ticks[:row]
+
+    def verdict(self) -> Verdict:
+        """What the pass found; ``log.damage`` is known by now."""
+        if self.difference is not None:
+            return Verdict("differs", self.compared, self.difference, self.log.damage or "")
+        if self.why:
+            return Verdict("cannot", self.compared, why=self.why)
+        if self.compared == 0:
+            empty = "the log has no ticks" if self.ticks == 0 else "the window has no ticks"
+            return Verdict("cannot", 0, why=self.log.damage or empty)
+        return Verdict("same", self.compared, why=self.log.damage or "")
+
+
+def _run(replay: _Replay, blocks: Iterable[TickArray], seen: Callable[[int], None]) -> Verdict:
+    for ticks in blocks:
+        more = len(ticks) == 0 or replay.take(ticks)
+        seen(replay.ticks)
+        if not more:
+            break
+    return replay.verdict()
+
+
 def replay_log(log: Log) -> Verdict:
     """Replay a log that has been read."""
-    if len(log.ticks) == 0:
-        return Verdict("cannot", 0, why=log.damage or "the log has no ticks")
-    gaps, ticks = log.gaps, log.ticks
-    if int(ticks["k"][0]) != 0:
-        return Verdict(
-            "cannot", 0, why=f"the log begins at tick {int(ticks['k'][0])}; its beginning is missing"
-        )
-    if gaps:
-        k, missing = gaps[0]
-        ticks = ticks[: int(np.searchsorted(ticks["k"], k))]
-    difference = compare(ticks, replayed(machine_of(log), ticks))
-    if difference is not None:
-        return Verdict("differs", len(ticks), difference, log.damage or "")
-    if gaps:
-        why = f"same up to tick {int(ticks['k'][-1])}, then {missing} records are missing before tick {k}"
-        return Verdict("cannot", len(ticks), why=why)
-    return Verdict("same", len(ticks), why=log.damage or "")
+    return _run(_Replay(log, Window()), [log.ticks], lambda _: None)
 
 
-def replay(path: Path) -> Verdict:
-    """Replay a file; what can't be replayed is a verdict, not an exception."""
+def tick_blocks(log: Log) -> Iterator[TickArray]:
+    """The ticks of a log file, block by block."""
+    for block in read_blocks(log):
+        if block.kind == "ticks":
+            yield block.records
+
+
+def replay(path: Path, window: Window | None = None, seen: Callable[[int], None] | None = None) -> Verdict:
+    """Replay a file; what can't be replayed is a verdict, not an exception.
+
+    ``seen`` is told after each block how many ticks are done.
+    """
     try:
-        return replay_log(open_log(path, frames=False))
+        if not path.is_file():
+            raise LogError(f"{path}: no such file")
+        log = Log(path, new_ticks(0))
+        return _run(_Replay(log, window or Window()), tick_blocks(log), seen or (lambda _: None))
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))

@@ -6,7 +6,9 @@ delivers their frames, so its outputs equal those of a lockstep run to the bit.
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -113,20 +115,31 @@ class Simulation:
 
     def blocks(self) -> Any:
         """Yield tick arrays of up to BLOCK ticks until the run has ended; each is overwritten by the next."""
-        machine, tick, out, k = self.setup.machine.fresh(), new_ticks(), new_sample(), 0
-        period_ns = self.setup.config.loop.period_ns
-        ticks = new_ticks(
-            BLOCK
-        )  # one for all: fresh pages for each block would cost more than the control law
+        ticks = new_ticks(BLOCK)  # one for all: fresh pages would cost more than the control law
+        advance_into = self._into()
+        k = 0
         while True:
-            count = simulate_block(
-                machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
-                self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
-            )  # fmt: skip
+            count = advance_into(ticks, k)
             yield ticks[:count]
             k += count
             if count < BLOCK or _over(ticks[count - 1]):
                 return
+
+    def warm_up(self) -> None:
+        """Compile everything: a block of no ticks changes nothing."""
+        self._into()(new_ticks(0), 0)
+
+    def _into(self) -> Callable[[TickArray, int], int]:
+        machine, tick, out = self.setup.machine.fresh(), new_ticks(), new_sample()
+        period_ns = self.setup.config.loop.period_ns
+
+        def into(ticks: TickArray, k: int) -> int:
+            return simulate_block(
+                machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
+                self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
+            )  # fmt: skip
+
+        return into
 
 
 def _over(tick: Any) -> bool:
@@ -150,31 +163,50 @@ def simulate_ticks(setup: Setup, plant_settings: list[str] | None = None) -> Tic
     return np.concatenate([ticks.copy() for ticks in make_simulation(setup, plant_settings or []).blocks()])
 
 
-def simulate(setup: Setup, plant_settings: list[str]) -> dict[str, Any]:
-    """Simulate, write the log, return the result for ``--json``."""
+def simulate(
+    setup: Setup, plant_settings: list[str], *, log: bool = True, seen: Callable[[int], None] | None = None
+) -> dict[str, Any]:
+    """Simulate, write the log if there is to be one, return the result for ``--json``.
+
+    ``seen`` is told after each block how many ticks are done. The compiler's time does not count.
+    """
     simulation = make_simulation(setup, plant_settings)
+    simulation.warm_up()
     path = log_path(setup, "simulate")
-    check_folder(path, needed_bytes(setup.config))
+    if log:
+        check_folder(path, needed_bytes(setup.config))
     start = time.perf_counter()
-    file = RunFile(path, header_of(setup, "simulate", "lockstep"))
-    last, count = new_ticks()[0], 0
-    state = int(DriveState.SWITCH_ON_DISABLED)
-    for ticks in simulation.blocks():
-        for row in np.nonzero(np.diff(ticks["state"].astype(np.int64), prepend=state))[0]:
-            t = ticks[row]
-            file.add_event(int(t["t_ns"]), int(t["k"]), *transition_event(int(t["state"]), int(t["reason"])))
-        state = int(ticks["state"][-1])
-        file.add_ticks(ticks)
-        last, count = ticks[-1].copy(), count + len(ticks)
-    reason = Reason(int(last["reason"])).name.lower()
-    file.finish({"ended": reason, "ticks": count, "skipped": 0})
+    with contextlib.ExitStack() as stack:
+        header = header_of(setup, "simulate", "lockstep") if log else {}
+        file = stack.enter_context(RunFile(path, header)) if log else None
+        last, count = _through(simulation, file, seen or (lambda _: None))
+        reason = Reason(int(last["reason"]))
+        if file:
+            file.finish({"ended": reason.name.lower(), "ticks": count, "skipped": 0})
     wall_s = time.perf_counter() - start
     simulated_s = count * setup.config.loop.period_ns * 1e-9
     return {
-        "log": str(path),
+        "log": str(path) if log else None,
         "ticks": count,
-        "ended": reason,
-        "ok": int(last["reason"]) == Reason.STOP_REQUESTED,
+        "ended": reason.name.lower(),
+        "ok": reason == Reason.STOP_REQUESTED,
         "simulated_s": simulated_s,
+        "wall_s": wall_s,
         "x_realtime": simulated_s / wall_s,
     }
+
+
+def _through(simulation: Simulation, file: RunFile | None, seen: Callable[[int], None]) -> tuple[Any, int]:
+    """Run to the end, ticks and changes of state into the file; the last tick and how many there were."""
+    last, count, state = new_ticks()[0], 0, int(DriveState.SWITCH_ON_DISABLED)
+    for ticks in simulation.blocks():
+        if file:
+            for row in np.nonzero(np.diff(ticks["state"].astype(np.int64), prepend=state))[0]:
+                t = ticks[row]
+                event = transition_event(int(t["state"]), int(t["reason"]))
+                file.add_event(int(t["t_ns"]), int(t["k"]), *event)
+            file.add_ticks(ticks)
+        state = int(ticks["state"][-1])
+        last, count = ticks[-1].copy(), count + len(ticks)
+        seen(count)
+    return last, count

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from hil.app import RunResult
 from hil.replay import Verdict
 from hil.signals import Reason
+from hil.whatif import WhatIf
 
 
 def show(table: Table) -> None:
@@ -95,6 +99,54 @@ def run_table(result: RunResult) -> Table:
     return key_values("hil run", rows)
 
 
-def replay_table(log: Path, verdict: Verdict) -> Table:
-    """What a replay found."""
-    return key_values("hil replay", {"log": log, "verdict": verdict_text(verdict.as_dict())})
+def replay_table(results: list[tuple[Path, Verdict, float]]) -> Table:
+    """What replays found, one row a log."""
+    table = Table(title="hil replay", title_justify="left")
+    for name in ("log", "verdict"):
+        table.add_column(name, overflow="fold")
+    table.add_column("s", justify="right")
+    for path, verdict, seconds in results:
+        table.add_row(str(path), verdict_text(verdict.as_dict()), f"{seconds:.2f}")
+    return table
+
+
+def sweep_table(rows: list[dict[str, Any]]) -> Table:
+    """The cases of a sweep, one row each."""
+    table = Table(title="hil simulate", title_justify="left")
+    for setting in rows[0]["case"]:
+        table.add_column(setting.partition("=")[0])
+    table.add_column("ended")
+    columns = {"tracking_rms_rad_s": "rad/s rms", "dip_rad_s": "rad/s", "recovery_ms": "ms", "i_max_a": "A"}
+    for name in ("tracking", "dip", "recovery", "largest |i|"):
+        table.add_column(name, justify="right")
+    for row in rows:
+        values = [setting.partition("=")[2] for setting in row["case"]]
+        numbers = [_number(row[key], unit) for key, unit in columns.items()]
+        table.add_row(*values, row["ended"].replace("_", " "), *numbers)
+    return table
+
+
+def what_if_table(found: WhatIf) -> Table:
+    """How another controller differs from the one that ran."""
+    table = Table(title=f"{found.config.name} over {found.log.name}, open loop", title_justify="left")
+    table.add_column("new - logged")
+    for name in ("rms", "max", "ticks"):
+        table.add_column(name, justify="right")
+    for row in found.as_dict()["rows"]:
+        unit = row["unit"]
+        table.add_row(
+            row["signal"], f"{row['rms']:.4g} {unit}", f"{row['max']:.4g} {unit}", str(row["ticks"])
+        )
+    return table
+
+
+@contextlib.contextmanager
+def progress(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
+    """A progress bar on standard error for as long as the block runs; nothing where that is no terminal."""
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda _: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(text, total=total)
+        yield lambda done: bar.update(task, completed=done)

@@ -26,6 +26,15 @@ def register(commands: Commands) -> None:
         "config", type=Path, metavar="CONFIG", help="run configuration with an [emulator] table"
     )
     command.add_argument("--duration", type=float, metavar="S", help="simulate S seconds")
+    command.add_argument("--no-log", action="store_true", help="write no log")
+    for flag, what in (("--sweep", "config"), ("--plant-sweep", "plant")):
+        command.add_argument(
+            flag,
+            action="append",
+            default=[],
+            metavar="KEY=[V,...]",
+            help=f"a table over all combinations of values of {what} keys, without logs",
+        )
     command.add_argument(
         "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
     )
@@ -41,14 +50,34 @@ def cmd_emulate(args: argparse.Namespace) -> int:
 
 
 def cmd_simulate(args: argparse.Namespace) -> int:
-    """Simulate a config."""
+    """Simulate a config, or a sweep over it."""
     from hil.app import load_setup
     from hil.simulate import simulate
-    from hil.view import key_values, show
+    from hil.view import key_values, progress, show
 
-    result = simulate(load_setup(args.config, overrides(args)), args.plant_set)
+    if args.sweep or args.plant_sweep:
+        return _sweep(args)
+    setup = load_setup(args.config, overrides(args))
+    loop = setup.config.loop
+    total = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
+    with progress("simulate", total) as seen:
+        result = simulate(setup, args.plant_set, log=not args.no_log, seen=seen)
     if args.json:
         print_json(result)
     else:
-        show(key_values("simulation", result))
+        show(key_values("hil simulate", result))
     return 0 if result["ok"] else EXIT_FAILED
+
+
+def _sweep(args: argparse.Namespace) -> int:
+    from hil.sweep import cases, sweep
+    from hil.view import progress, show, sweep_table
+
+    every = cases(args.sweep, args.plant_sweep)
+    with progress(f"simulate {len(every)} cases", len(every)) as seen:
+        rows = sweep(args.config, overrides(args), args.plant_set, every, seen)
+    if args.json:
+        print_json({"rows": rows})
+    else:
+        show(sweep_table(rows))
+    return 0 if all(row["ended"] == "stop_requested" for row in rows) else EXIT_FAILED

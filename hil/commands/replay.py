@@ -1,29 +1,108 @@
-"""``hil replay``: the controller over a log."""
+"""``hil replay``: the controller over a log, or over many; or another controller over one."""
 
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, print_json
+from hil.commands.common import Commands, print_json, say
+
+if TYPE_CHECKING:
+    from hil.replay import Verdict, Window
+
+TEXT = "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 cannot; the worst of many."
 
 
 def register(commands: Commands) -> None:
     """Add what this module offers."""
-    command = commands.add(
-        "replay", cmd_replay, "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 cannot."
+    command = commands.add("replay", cmd_replay, TEXT)
+    command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="MCAP files of hil")
+    command.add_argument(
+        "--from",
+        dest="start",
+        type=float,
+        default=0.0,
+        metavar="S",
+        help="compare from S seconds of the run on (the controller's state still comes from its start)",
     )
-    command.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    command.add_argument("--to", dest="end", type=float, metavar="S", help="compare up to S seconds")
+    command.add_argument("--junit", type=Path, metavar="FILE", help="verdicts as JUnit XML")
+    command.add_argument(
+        "--config",
+        type=Path,
+        metavar="NEW",
+        help="instead: what the controller of NEW would have estimated and asked for (open loop)",
+    )
+    command.add_argument("-o", "--output", type=Path, metavar="FILE", help="with --config: its ticks as MCAP")
 
 
 def cmd_replay(args: argparse.Namespace) -> int:
-    """Replay a log."""
+    """Replay logs."""
+    from hil.errors import HilError
+    from hil.replay import Window
+
+    end = float("inf") if args.end is None else args.end
+    if args.config:
+        if len(args.logs) > 1 or args.junit or args.start or args.end is not None:
+            raise HilError("--config takes one log and no --junit, --from or --to")
+        return _what_if(args)
+    if args.output:
+        raise HilError("-o needs --config; a replay itself writes nothing")
+    if not 0 <= args.start < end:
+        raise HilError(f"--from {args.start:g} --to {end:g}: no such window")
+    results = [_timed(path, Window(args.start, end)) for path in args.logs]
+    _report(args, results)
+    return max(verdict.exit_code for _, verdict, _ in results)
+
+
+def _timed(path: Path, window: Window) -> tuple[Path, Verdict, float]:
     from hil.replay import replay
+    from hil.view import progress
+
+    start = time.perf_counter()
+    with progress(f"replay {path.name}", _ticks_of(path)) as seen:
+        verdict = replay(path, window, seen)
+    return path, verdict, time.perf_counter() - start
+
+
+def _ticks_of(path: Path) -> int | None:
+    """How many ticks the summary counts, None where there is none: for the progress bar alone."""
+    from hil.errors import HilError
+    from hil.log.info import info
+
+    try:
+        return info(path).counts.get("/tick") if path.is_file() else None
+    except HilError:
+        return None
+
+
+def _report(args: argparse.Namespace, results: list[tuple[Path, Verdict, float]]) -> None:
     from hil.view import replay_table, show
 
-    verdict = replay(args.log)
-    if args.json:
-        print_json(verdict.as_dict())
+    if args.junit:
+        from hil.junit import junit
+
+        args.junit.write_text(junit(results), encoding="utf-8")
+    if not args.json:
+        show(replay_table(results))
+    elif len(results) == 1:
+        print_json(results[0][1].as_dict())
     else:
-        show(replay_table(args.log, verdict))
-    return verdict.exit_code
+        print_json({"rows": [{"log": str(path)} | verdict.as_dict() for path, verdict, _ in results]})
+
+
+def _what_if(args: argparse.Namespace) -> int:
+    from hil.config import RunConfig, load_toml
+    from hil.view import show, what_if_table
+    from hil.whatif import what_if
+
+    config = load_toml(args.config, RunConfig, [])
+    found = what_if(args.logs[0], args.config, config, args.output)
+    if args.json:
+        print_json(found.as_dict())
+    else:
+        show(what_if_table(found))
+        say("open loop: the motor answered to the logged commands, not to these")
+    return 0

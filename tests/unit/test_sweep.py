@@ -1,0 +1,56 @@
+"""`hil simulate --sweep` and `--no-log`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hil.app import Overrides, load_setup
+from hil.cli import main
+from hil.errors import ConfigError
+from hil.simulate import simulate
+from hil.sweep import axis, cases
+
+CONFIG = Path(__file__).parents[2] / "configs" / "demo.toml"
+
+
+def test_axes_become_every_combination() -> None:
+    found = cases(["a.x=[1, 2]"], ["b.y=[0.5, 1.5, 2.5]", 'c.z=["u", "v"]'])
+    assert len(found) == 12
+    assert found[0].config == ("a.x=1",) and found[0].plant == ("b.y=0.5", 'c.z="u"')
+    assert found[-1].config == ("a.x=2",) and found[-1].plant == ("b.y=2.5", 'c.z="v"')
+    assert axis("--sweep", "a.b=[true]") == ["a.b=true"]
+
+
+@pytest.mark.parametrize("text", ["a.b=3", "a.b=[]", "a.b", "=[1]", "a.b=[1", "a.b={x=1}"])
+def test_what_is_no_axis_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="is not of the form"):
+        axis("--sweep", text)
+
+
+def test_too_many_cases_are_refused() -> None:
+    wide = f"a.b={list(range(200))}"
+    with pytest.raises(ConfigError, match="40000 combinations"):
+        cases([wide], [wide])
+
+
+def test_a_heavier_motor_dips_less(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["simulate", str(CONFIG), "--json", "--plant-sweep", "motor.J_kg_m2=[0.008, 0.0143]"]
+    assert main(words) == 0
+    light, heavy = json.loads(capsys.readouterr().out)["rows"]
+    assert light["case"] == ["motor.J_kg_m2=0.008"] and heavy["case"] == ["motor.J_kg_m2=0.0143"]
+    assert light["dip_rad_s"] > heavy["dip_rad_s"] > 1.0
+
+
+def test_a_key_that_is_none_is_named_before_any_case_runs() -> None:
+    assert main(["simulate", str(CONFIG), "--sweep", "controller.speed_pole=[1.0]"]) == 2
+
+
+def test_without_a_log_nothing_is_written(tmp_path: Path) -> None:
+    settings = (f'log.folder="{tmp_path}"', "loop.duration_s=1.0")
+    seen: list[int] = []
+    result = simulate(load_setup(CONFIG, Overrides(settings=settings)), [], log=False, seen=seen.append)
+    assert result["log"] is None and result["ok"] and list(tmp_path.iterdir()) == []
+    assert seen[-1] == result["ticks"]
