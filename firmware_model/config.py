@@ -137,6 +137,7 @@ class PlantConfig(Table):
 
     dbc: str
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
+    protocol: Literal["house", "inverter"] = "house"
     pacing: Literal["sync", "cyclic"] = "sync"
     substep_us: Annotated[int, Field(ge=1)] = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1

@@ -27,7 +27,7 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     """Load everything, open the bus; return the node and a line that says what it is."""
     plant, folder = load_plant(path, config, plant_settings)
     database = Database(folder / plant.dbc, plant.node_id)
-    params = build_params(plant, wire_of(database))
+    params = build_params(plant, wire_of(database, plant.protocol))
     link = open_link(bus_settings(config))
     node = Node(
         link,
@@ -37,6 +37,7 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         pacing=plant.pacing,
         period_ns=config.loop.period_ns,
         truth=plant.truth,
+        protocol=plant.protocol,
     )
     bus = config.bus
     motor = plant.motor.name or "inline"

@@ -153,7 +153,7 @@ def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
         raise ConfigError(str(setup.path), ["loop.duration_s: missing; a simulation must end"])
     plant, folder = load_plant(setup.path, setup.config, plant_settings)
     database = Database(folder / plant.dbc, plant.node_id)
-    params = build_params(plant, wire_of(database))
+    params = build_params(plant, wire_of(database, plant.protocol))
     state = new_state(params, setup.wire.counter_modulus - 1)
     return Simulation(setup, params, state, ticks)
 
