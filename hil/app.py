@@ -9,8 +9,9 @@ import platform
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -76,6 +77,8 @@ class RunResult:
     complete: bool
     dropped: int
     grants: list[realtime.Grant] = field(default_factory=list)
+    processor_us: float = 0.0
+    """Processor time of the loop's thread, per tick [us]."""
 
     @property
     def ok(self) -> bool:
@@ -92,6 +95,8 @@ class RunResult:
             "ended": Reason(self.outcome.reason).name.lower(),
             "dropped": self.dropped,
             "log_complete": self.complete,
+            "processor_us": self.processor_us,
+            "grants": [asdict(grant) for grant in self.grants],
             "ok": self.ok,
         }
 
@@ -300,13 +305,15 @@ def _run_armed(
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
     loop = Loop(drive, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)
     grants: list[realtime.Grant] = []
-    outcome, failure = Outcome(), ""
+    outcome, failure, processor_ns = Outcome(), "", 0
     try:
         with stopping_on_signals(request):
             if clock.name == "monotonic":
                 grants = realtime.acquire(setup.config.realtime)
             with watching(os.getpid(), plan.ticks):
+                begin_ns = time.thread_time_ns()
                 outcome = loop.run()
+                processor_ns = time.thread_time_ns() - begin_ns
     except BaseException as error:
         failure = f"{type(error).__name__}: {error}"
         raise
@@ -316,7 +323,8 @@ def _run_armed(
         ended = failure or Reason(outcome.reason).name.lower()
         result = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
         complete = recorder.close(result)
-    return RunResult(str(recorder.path), outcome, complete, dropped, grants)
+    processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
+    return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us)
 
 
 @contextlib.contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hil.commands import demo, emulated, log, paper, replay, run
+from hil.commands import bench, demo, emulated, log, paper, replay, run
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -18,9 +18,10 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
   hil info LOG, recover LOG    what is in a log; rewrite a damaged one
+  hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, emulated, replay, log, paper)
+MODULES = (demo, run, emulated, replay, log, paper, bench)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,0 +1,157 @@
+"""One bench from beginning to end: runs, anchors, replay and simulation, as one dictionary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hil.app import Overrides, load_setup
+from hil.bench.cyclictest import Anchor, cyclictest
+from hil.bench.histogram import Histogram
+from hil.bench.machine import machine_facts
+from hil.bench.processes import BareRun, LoopRun, Stand, bare_run, hil_run, stand
+from hil.clock import RealClock
+from hil.replay import replay
+from hil.signals import TickArray
+from hil.simulate import simulate
+
+GOOD: Final = 0.999
+RATES: Final = (1000, 2000, 2500, 4000, 5000, 6250, 8000, 10_000)
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """How long each part takes [s] and which rates are tried [Hz]."""
+
+    run_s: float
+    probe_s: float
+    simulated_s: float
+    rates: tuple[int, ...]
+
+
+FULL: Final = Length(20.0, 3.0, 60.0, RATES)
+QUICK: Final = Length(2.0, 1.0, 10.0, ())
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """The result for people and ``--json``, and both histograms for the figure."""
+
+    result: dict[str, Any]
+    ours: Histogram
+    anchor: Histogram | None
+
+
+def bench(path: Path, overrides: Overrides, length: Length, say: Say) -> Bench:
+    """Measure everything on the bus of a configuration. Raises HilError with one clear line."""
+    with stand(path, overrides) as one:
+        loop = one.setup.config.loop
+        say(f"bench: {length.run_s:g} s at {loop.rate_hz} Hz beside the bare loop and cyclictest")
+        floor = bare_run(one, loop.rate_hz, length.run_s)
+        run = hil_run(one, loop.rate_hz, length.run_s)
+        anchor = cyclictest(loop.period_ns, length.run_s, one.setup.config.realtime.fifo_priority)
+        replay_x = _replay_speed(run)
+        rates = _rates(one, length, run, floor, say)
+    say("bench: simulation")
+    ours = Histogram.of(run.ticks["lateness_ns"].astype(np.int64))
+    result = _result(run, floor, ours, anchor) | rates
+    result |= {"replay_x_realtime": replay_x, "simulate_x_realtime": _simulate_speed(path, overrides, length)}
+    return Bench(result | {"machine": machine_facts()}, ours, anchor.lateness)
+
+
+def _result(run: LoopRun, floor: BareRun, ours: Histogram, anchor: Anchor) -> dict[str, Any]:
+    """What one run at the configured rate says."""
+    processor, bare = float(run.said["processor_us"]), float(floor.said["processor_us"])
+    tick_us = phases(run.ticks)
+    theirs = anchor.lateness
+    return {
+        "run_rate_hz": run.rate_hz,
+        "ticks": run.said["ticks"],
+        "skipped": run.said["skipped"],
+        "dropped": run.said["dropped"],
+        "in_time": run.in_time,
+        "processor_us": processor,
+        "bare_processor_us": bare,
+        "processor_ratio": processor / bare,
+        "tick_us": tick_us,
+        "record_us": tick_us["record"],
+        "lateness_us": ours.as_dict(),
+        "cyclictest_us": theirs.as_dict() if theirs else None,
+        "cyclictest": anchor.note,
+        "lateness_ratio_p999": ours.percentile(GOOD) / max(1.0, theirs.percentile(GOOD)) if theirs else None,
+        "start_s": run.armed_s,
+        "growth_kib": run.growth_kib,
+        "grants": run.said.get("grants", []),
+    }
+
+
+def phases(ticks: TickArray) -> dict[str, float]:
+    """Median time of each phase [us], from the stamps in the log: wall time, not processor time.
+
+    ``exchange`` is SYNC out to feedback in and holds the drive's own time; ``control`` is reference,
+    supervisor, law and guard; ``record`` is the tick's record alone.
+    """
+    late, received, computed, sent = (
+        ticks[f"{name}_ns"].astype(np.int64) for name in ("lateness", "received", "computed", "sent")
+    )
+    parts = {
+        "exchange": received - late,
+        "control": computed - received,
+        "send": sent - computed,
+        "record": ticks["recorded_ns"][1:].astype(np.int64) - sent[:-1],
+    }
+    return {name: float(np.median(value)) * 1e-3 if len(value) else 0.0 for name, value in parts.items()}
+
+
+def _rates(one: Stand, length: Length, run: LoopRun, floor: BareRun, say: Say) -> dict[str, Any]:
+    """The highest rates that hold, ours and the bare loop's; ``tried``: what share was in time at each."""
+    tried: list[dict[str, Any]] = []
+
+    def holds(kind: str, rate_hz: int) -> bool:
+        result = (hil_run if kind == "hil" else bare_run)(one, rate_hz, length.probe_s)
+        tried.append({"loop": kind, "rate_hz": rate_hz, "in_time": result.in_time})
+        say(f"bench: {kind} at {rate_hz} Hz: {100 * result.in_time:.2f} % in time")
+        return result.in_time >= GOOD
+
+    own = run.rate_hz if run.in_time >= GOOD else 0
+    bare = floor.rate_hz if floor.in_time >= GOOD else 0
+    rates = [rate for rate in length.rates if rate > run.rate_hz]
+    return {
+        "rate_hz": highest(rates, lambda rate: holds("hil", rate)) or own,
+        "bare_rate_hz": highest(rates, lambda rate: holds("bare", rate)) or bare,
+        "tried": tried,
+    }
+
+
+def highest(rates: Sequence[int], holds: Callable[[int], bool]) -> int:
+    """The highest of ascending rates that holds, by bisection; 0 when none does."""
+    low, high = -1, len(rates)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if holds(rates[middle]) else (low, middle)
+    return rates[low] if low >= 0 else 0
+
+
+def _replay_speed(run: LoopRun) -> float:
+    """Logged seconds per second of replay, from file to verdict, kernels warm."""
+    clock, span_s = RealClock(), int(run.ticks["k"][-1]) / run.rate_hz
+    replay(run.log)
+    begin_ns = clock.now_ns()
+    replay(run.log)
+    return float(span_s / ((clock.now_ns() - begin_ns) * 1e-9))
+
+
+def _simulate_speed(path: Path, overrides: Overrides, length: Length) -> float:
+    """Simulated seconds per second, log included, kernels warm."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory(prefix="hil-bench-") as folder:
+        for seconds in (0.1, length.simulated_s):
+            settings = (*overrides.settings, f'log.folder="{folder}"', f"loop.duration_s={seconds}")
+            result = simulate(load_setup(path, Overrides(settings=settings)), [])
+    return float(result["x_realtime"])

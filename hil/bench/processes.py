@@ -1,0 +1,152 @@
+"""The processes that are measured: the emulated drive, `hil run`, and the bare loop on the same bus."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hil.app import Overrides, Setup, is_emulated_bus, load_setup
+from hil.bench.machine import resident_kib
+from hil.clock import RealClock
+from hil.demo import emulator_process
+from hil.errors import HilError
+from hil.log.reader import open_log
+from hil.signals import RxFlag, TickArray
+
+SLACK_S: Final = 60.0
+SETTLED_S: Final = 0.5
+CALM_PLANT: Final = ("load=[]", "firmware={watchdog_ms=400.0}")
+"""No load that moves the motor while nobody drives it: the same drive answers all loops of a bench."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """Where everything runs: configuration with its bus, and the folder of the logs."""
+
+    path: Path
+    overrides: Overrides
+    setup: Setup
+    folder: Path
+
+    def overrides_at(self, rate_hz: int, seconds: float, limited: bool = True) -> Overrides:
+        """Settings of one run: its rate and length, patient with what a loaded machine does to it."""
+        more = [f"loop.rate_hz={rate_hz}", f"loop.duration_s={seconds}", 'loop.clock="realtime"']
+        more += [f"loop.feedback_timeout_us={800_000 // rate_hz}", f'log.folder="{self.folder}"']
+        more += ["feedback.hold_ticks=900", "feedback.quick_stop_ticks=1000", "loop.max_gap_ticks=64"]
+        more += ["feedback.error_budget=10000"]
+        return replace(self.overrides, settings=(*self.overrides.settings, *more))
+
+
+@dataclass(frozen=True, slots=True)
+class LoopRun:
+    """One `hil run`: its ticks, what it said, and from its start to arming [s]."""
+
+    rate_hz: int
+    ticks: TickArray
+    said: dict[str, Any]
+    armed_s: float
+    log: Path
+    growth_kib: int
+
+    @property
+    def in_time(self) -> float:
+        """Share of the periods in which the command went out before the next deadline, on fresh feedback."""
+        ticks = self.ticks
+        fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
+        good = np.count_nonzero(fresh & (ticks["sent_ns"] < 1_000_000_000 // self.rate_hz))
+        return float(good) / max(1, int(ticks["k"][-1]) + 1) if len(ticks) else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class BareRun:
+    """One bare loop: what it said."""
+
+    rate_hz: int
+    said: dict[str, Any]
+
+    @property
+    def in_time(self) -> float:
+        """The same share as :attr:`LoopRun.in_time`."""
+        ticks, bad = self.said["ticks"], self.said["late"] + self.said["lost"]
+        return float(max(0, ticks - bad) / (ticks + self.said["skipped"]))
+
+
+@contextlib.contextmanager
+def stand(path: Path, overrides: Overrides) -> Iterator[Stand]:
+    """A bus of its own with an emulated drive on it; its logs go when it ends. Raises HilError."""
+    if overrides.channel is None and load_setup(path, overrides).config.bus.interface == "hil-local":
+        overrides = replace(overrides, channel=f"bench-{uuid.uuid4().hex[:8]}")
+    setup = load_setup(path, overrides)
+    if not is_emulated_bus(setup.config):
+        raise HilError(
+            f"{setup.config.bus.interface}:{setup.config.bus.channel}: a bench runs the emulated drive; "
+            "name a bus without a real one (hil-local or vcan)"
+        )
+    with tempfile.TemporaryDirectory(prefix="hil-bench-") as folder:
+        one = Stand(path, overrides, setup, Path(folder))
+        with emulator_process(path, one.overrides_at(setup.config.loop.rate_hz, 1.0), CALM_PLANT):
+            yield one
+
+
+def hil_run(stand: Stand, rate_hz: int, seconds: float) -> LoopRun:
+    """Run the controller as a process and read its log. Raises HilError when it refused or has lost ticks."""
+    clock = RealClock()
+    command = [sys.executable, "-m", "hil.cli", "run", str(stand.path), "--json"]
+    for setting in stand.overrides_at(rate_hz, seconds).as_settings():
+        command += ["--set", setting]
+    begin_ns = clock.now_ns()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None  # noqa: S101 - PIPE was asked for
+    try:
+        heard = []
+        for line in process.stderr:
+            heard.append(line)
+            if ": arming;" in line:
+                break
+        armed_ns = clock.now_ns()
+        growth = _growth_kib(process.pid, armed_ns, seconds)
+        out, error = process.communicate(timeout=seconds + SLACK_S)
+    finally:
+        process.kill()
+    if not out.startswith("{"):
+        raise HilError(f"hil run at {rate_hz} Hz: {(''.join(heard) + error).strip()}")
+    said = json.loads(out)
+    log = Path(said["log"])
+    return LoopRun(
+        rate_hz, open_log(log, frames=False).ticks, said, (armed_ns - begin_ns) * 1e-9, log, growth
+    )
+
+
+def _growth_kib(pid: int, armed_ns: int, seconds: float) -> int:
+    """What the process's memory grew between its first half second and its last [KiB]."""
+    clock = RealClock()
+    clock.sleep_until(armed_ns + round(SETTLED_S * 1e9))
+    before = resident_kib(pid)
+    clock.sleep_until(armed_ns + round(max(SETTLED_S, seconds - 0.2) * 1e9))
+    after = resident_kib(pid)
+    return after - before if before and after else 0
+
+
+def bare_run(stand: Stand, rate_hz: int, seconds: float) -> BareRun:
+    """Run the bare loop on the same bus with the same drive. Raises HilError."""
+    config = stand.setup.config
+    command = [sys.executable, "-m", "drivers.bare", config.bus.interface, config.bus.channel]
+    command += [str(stand.setup.database.path), "--rate", str(rate_hz)]
+    command += ["--ticks", str(round(rate_hz * seconds)), "--node", str(config.drive.node_id)]
+    command += ["--fifo", str(config.realtime.fifo_priority)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=seconds * 10 + SLACK_S, check=False
+    )
+    if done.returncode != 0:
+        raise HilError(f"bare loop at {rate_hz} Hz: {done.stderr.strip()}")
+    return BareRun(rate_hz, json.loads(done.stdout))

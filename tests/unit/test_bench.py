@@ -1,0 +1,121 @@
+"""What `hil bench` computes of what it measured; the measuring itself is tested on real processes."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.bench.cyclictest import MISSING, cyclictest, parse
+from hil.bench.histogram import TOP_US, Histogram
+from hil.bench.machine import machine_facts, resident_kib
+from hil.bench.measure import highest, phases
+from hil.bench.view import ratios, read_result
+from hil.errors import HilError
+from hil.signals import new_ticks
+
+CYCLICTEST = """\
+# /dev/cpu_dma_latency set to 0us
+# Histogram
+000000 000000
+000003 000007
+000010 000090
+000015 000002
+# Total: 000000099
+# Min Latencies: 00003
+# Avg Latencies: 00009
+# Max Latencies: 25000
+# Histogram Overflows: 00001
+# Histogram Overflow at cycle number:
+# Thread 0: 77
+"""
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9, 0.99, 0.999, 1.0])
+def test_percentiles_are_the_sorted_values_to_a_microsecond(share: float) -> None:
+    late_ns = np.random.default_rng(7).integers(1000, 90_000, 5000)
+    exact_us = np.sort(late_ns)[int(np.ceil(share * len(late_ns))) - 1] * 1e-3
+    assert exact_us <= Histogram.of(late_ns).percentile(share) <= exact_us + 1.0, "seed 7"
+
+
+def test_what_is_later_than_the_histogram_is_counted_in_its_last_place() -> None:
+    histogram = Histogram.of(np.array([5_000, 10**9, 2 * 10**9]))
+    assert histogram.counts[5] == 1 and histogram.counts[TOP_US - 1] == 2
+    assert histogram.max == 2e6
+
+
+def test_octaves_hold_every_sample_once() -> None:
+    late_ns = np.random.default_rng(3).integers(0, 50_000_000, 999)
+    octaves = Histogram.of(late_ns).as_dict()["histogram"]
+    assert sum(count for _, _, count in octaves) == 999, "seed 3"
+    assert all(a[1] == b[0] for a, b in pairwise(octaves))
+
+
+def test_no_samples_are_no_error() -> None:
+    assert Histogram.of(np.zeros(0, np.int64)).as_dict()["p999"] == 0.0
+
+
+def test_cyclictests_output_is_read() -> None:
+    histogram = parse(CYCLICTEST)
+    assert (histogram.counts[3], histogram.counts[10], histogram.counts[15]) == (7, 90, 2)
+    assert histogram.counts[-1] == 1 and histogram.counts.sum() == 100
+    assert histogram.max == 25000.0
+    assert histogram.percentile(0.5) == 11.0
+
+
+def test_without_cyclictest_there_is_a_line_that_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr("hil.bench.cyclictest.OTHER_FOLDERS", ())
+    anchor = cyclictest(1_000_000, 1.0, 50)
+    assert anchor.lateness is None and anchor.note == MISSING
+
+
+@pytest.mark.parametrize("limit", [0, 1, 2, 3, 4, 5, 9])
+def test_the_highest_rate_is_found_with_few_tries(limit: int) -> None:
+    asked: list[int] = []
+
+    def holds(rate: int) -> bool:
+        asked.append(rate)
+        return rate <= limit
+
+    assert highest([1, 2, 3, 4, 5], holds) == (limit if limit <= 5 else 5)
+    assert len(asked) <= 3
+
+
+def test_phases_are_differences_of_the_stamps() -> None:
+    ticks = new_ticks(3)
+    for name, value in (("lateness", 10), ("received", 110), ("computed", 118), ("sent", 150)):
+        ticks[f"{name}_ns"] = value * 1000
+    ticks["recorded_ns"] = 153_000
+    assert phases(ticks) == pytest.approx({"exchange": 100.0, "control": 8.0, "send": 32.0, "record": 3.0})
+
+
+def test_ratios_are_now_over_then_where_both_have_a_figure() -> None:
+    now: dict[str, Any] = {"rate_hz": 4000, "tick_us": {"control": 6.0}, "cyclictest_us": None}
+    then = {"rate_hz": 2000, "tick_us": {"control": 12.0}, "cyclictest_us": {"p999": 80.0}}
+    found = ratios(now, then)
+    assert {key: one["ratio"] for key, one in found.items()} == {"rate_hz": 2.0, "tick_us.control": 0.5}
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"a": 1}', "{"])
+def test_a_file_that_is_no_bench_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "earlier.json"
+    path.write_text(text)
+    with pytest.raises(HilError, match="is no output of hil bench"):
+        read_result(path)
+
+
+def test_the_machine_is_described_in_json() -> None:
+    facts = machine_facts()
+    assert facts["cores"] >= 1 and facts["kernel"]
+    assert json.loads(json.dumps(facts)) == facts
+
+
+def test_memory_of_a_process_that_has_gone_is_zero() -> None:
+    assert resident_kib(2**22 + 1) == 0
