@@ -282,6 +282,27 @@ class LogTable(Table):
     frames: bool = True
 
 
+class CriteriaTable(Table):
+    """What a run must reach, judged by ``hil report``; every one is the largest value that passes."""
+
+    tracking_rms_max_rad_s: NonNegative | None = None
+    dip_max_rad_s: NonNegative | None = None
+    recovery_max_s: NonNegative | None = None
+    rise_max_s: NonNegative | None = None
+    overshoot_max_percent: NonNegative | None = None
+    settling_max_s: NonNegative | None = None
+    estimate_error_max_n_m: NonNegative | None = None
+    ripple_max_rad_s: NonNegative | None = None
+    iae_max_rad: NonNegative | None = None
+    skipped_max: Annotated[int, Field(ge=0)] | None = None
+    dropped_max: Annotated[int, Field(ge=0)] | None = None
+    lost_feedback_max: Annotated[int, Field(ge=0)] | None = None
+    crc_errors_max: Annotated[int, Field(ge=0)] | None = None
+    lateness_p999_max_us: NonNegative | None = None
+    lateness_max_us: NonNegative | None = None
+    bus_load_max_percent: NonNegative | None = None
+
+
 class EmulatorTable(Table):
     """The emulated drive that belongs to this run; its parameters are in its own file."""
 
@@ -302,6 +323,7 @@ class RunConfig(Table):
     feedback: FeedbackTable = FeedbackTable()
     reference: ReferenceTable
     log: LogTable = LogTable()
+    criteria: CriteriaTable = CriteriaTable()
     emulator: EmulatorTable | None = None
 
 

@@ -1,0 +1,153 @@
+"""One pass over a log: everything that a report shows of it, in memory that does not grow with its length."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hil.config import RunConfig, validate
+from hil.design import Machine
+from hil.errors import ConfigError, HilError
+from hil.log.reader import Log, LogError, read_blocks
+from hil.replay import Verdict, machine_of, replay
+from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
+from hil.report.envelope import CloseUps, Envelope, merged
+from hil.report.frames import Frames, FrameTime, names_of
+from hil.report.segments import Responses
+from hil.report.statistics import Phases, Spectrum, Totals
+from hil.signals import DriveState, TickArray, new_ticks
+
+STOP_WEIGHT: Final = 1e6  # a close-up of an end outweighs that of any load step
+
+
+@dataclass(slots=True)
+class Run:
+    """All that a report knows of one log. Times are seconds from the first tick."""
+
+    log: Log
+    name: str
+    config: RunConfig | None = None
+    config_problem: str = ""
+    N: tuple[int, int] = (1, 1)
+    frame_time: FrameTime | None = None
+    totals: Totals = field(default_factory=Totals)
+    phases: Phases = field(default_factory=Phases)
+    spectrum: Spectrum = field(default_factory=Spectrum)
+    responses: Responses = field(default_factory=Responses)
+    frames: Frames = field(default_factory=Frames)
+    envelope: Envelope = field(default_factory=lambda: Envelope(len(CURVES)))
+    close_ups: CloseUps = field(default_factory=CloseUps)
+    verdict: Verdict = field(default_factory=lambda: Verdict("cannot", 0, why="not asked for"))
+    first_ns: int | None = None
+    _state: int = int(DriveState.SWITCH_ON_DISABLED)
+
+    def feed(self, ticks: TickArray) -> None:
+        """Take the next ticks."""
+        if self.first_ns is None:
+            self.begin(ticks)
+        t: F8 = (ticks["t_ns"].astype(np.int64) - (self.first_ns or 0)).astype(np.float64) * 1e-9
+        values = values_of(ticks)
+        steps = self.responses.feed(t, ticks)
+        ends = self._transitions(ticks)
+        self.envelope.feed(t, values)
+        self.close_ups.feed(t, values, sorted(steps + ends))
+        self.totals.feed(t, ticks)
+        self.phases.feed(ticks)
+        self.spectrum.feed(ticks)
+
+    def begin(self, ticks: TickArray) -> None:
+        """At the first tick: its time, and the config, which stands before it in the file."""
+        self.first_ns = int(ticks["t_ns"][0])
+        self.read_config()
+
+    def read_config(self) -> None:
+        """The log's own config and design; what is unusable is said in the report."""
+        try:
+            data = json.loads(self.log.attachments["config.json"])
+            self.config = validate(data, RunConfig, "config.json", self.log.path.parent)
+            machine: Machine = machine_of(self.log)
+        except (KeyError, ValueError, TypeError, RecursionError) as error:
+            self.config_problem = f"the log has no usable config ({error!r})"
+        except (ConfigError, HilError) as error:
+            self.config_problem = str(error)
+        else:
+            windows = machine.law["N"][0]
+            self.N = (int(windows[0]), int(windows[1]))
+            self.responses.N = self.N[0]
+
+    def _transitions(self, ticks: TickArray) -> list[tuple[int, float]]:
+        """Rows where the supervisor's state changes for a reason."""
+        states = ticks["state"].astype(np.int64)
+        changed = (np.diff(states, prepend=self._state) != 0) & (ticks["reason"] != 0)
+        self._state = int(states[-1])
+        return [(int(row), STOP_WEIGHT) for row in np.nonzero(changed)[0]]
+
+    @property
+    def rate_hz(self) -> float:
+        """Ticks a second, by the config or else by the ticks."""
+        if self.config is not None:
+            return float(self.config.loop.rate_hz)
+        t, _, _ = self.envelope.bins()
+        return self.envelope.width / float(np.median(np.diff(t))) if len(t) > 1 and t[-1] > t[0] else 1000.0
+
+    @property
+    def span_s(self) -> float:
+        """Length of the run [s]."""
+        if self.first_ns is None or self.log.last_t_ns is None:
+            return 0.0
+        return (self.log.last_t_ns - self.first_ns) * 1e-9
+
+    @property
+    def ended(self) -> str:
+        """How the run says that it ended."""
+        return str(self.log.result.get("ended", "unknown: the log has no result"))
+
+    def curves(self) -> tuple[F8, F4, F4]:
+        """Times [s], minima and maxima of all curves."""
+        return merged(self.envelope, self.close_ups)
+
+    def lines(self) -> dict[str, list[tuple[float, str]]]:
+        """Limits a plot shows."""
+        return limit_lines(self.config, self.N)
+
+    def message_names(self) -> dict[int, str]:
+        """Names of CAN identifiers by the log's own DBC."""
+        node_id = self.config.drive.node_id if self.config else 1
+        return names_of(self.log.attachments.get("drive.dbc", ""), node_id)
+
+    def bus_load(self) -> tuple[float, float] | None:
+        """Mean and busiest second [%]."""
+        return self.frames.load(self.frame_time) if self.frame_time else None
+
+    def events(self, most: int) -> list[dict[str, Any]]:
+        """The first events of the log with times on the report's axis."""
+        first_ns = self.first_ns or 0
+        return [
+            {"t": (e["t_ns"] - first_ns) * 1e-9, "kind": e["kind"], "text": e["text"], "k": e["k"]}
+            for e in self.log.events[:most]
+        ]
+
+
+def collect(path: Path, *, verify: bool = True) -> Run:
+    """Read a log, and replay it when ``verify``. Raises LogError for what is no log of hil."""
+    if not path.is_file():
+        raise LogError(f"{path}: no such file")
+    log = Log(path, new_ticks(0))
+    run = Run(log, path.stem)
+    for block in read_blocks(log):
+        if not len(block.records):
+            continue
+        if block.kind == "ticks":
+            run.feed(block.records)
+        else:
+            run.frames.feed(block.records)
+    run.responses.finish()
+    if run.config is None and not run.config_problem:  # there was no tick
+        run.read_config()
+    if verify:
+        run.verdict = replay(path)
+    return run

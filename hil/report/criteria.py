@@ -1,0 +1,148 @@
+"""Pass or fail: what every run must be, and what its config demands of it in the table [criteria]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+from hil.report.collect import Run
+
+Outcome = Literal["pass", "fail", "no data"]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One line of the summary; ``no data`` is no pass."""
+
+    name: str
+    outcome: Outcome
+    found: str
+    wanted: str
+
+    def as_dict(self) -> dict[str, str]:
+        """JSON form."""
+        return {"name": self.name, "outcome": self.outcome, "found": self.found, "wanted": self.wanted}
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of a run: key, what it is called, its unit, how it is read (None for no data)."""
+
+    key: str
+    name: str
+    unit: str
+    of: Callable[[Run], float | None]
+
+
+def _worst(name: str) -> Callable[[Run], float | None]:
+    """Worst of all responses; infinite when one never came to rest."""
+    return lambda run: float("inf") if name in run.responses.unfinished else run.responses.worst.get(name)
+
+
+def _lateness(name: str) -> Callable[[Run], float | None]:
+    return lambda run: run.phases.lateness.as_dict()[name] if run.totals.ticks else None
+
+
+def _result(name: str) -> Callable[[Run], float | None]:
+    def read(run: Run) -> float | None:
+        value = run.log.result.get(name, 0 if run.log.result else None)
+        return float(value) if isinstance(value, (int, float)) else None
+
+    return read
+
+
+def _flag(name: str) -> Callable[[Run], float | None]:
+    return lambda run: run.totals.flags.get(name) if run.totals.ticks else None
+
+
+def _busiest(run: Run) -> float | None:
+    load = run.bus_load()
+    return load[1] if load else None
+
+
+FIGURES: Final = (
+    Figure("tracking_rms_rad_s", "tracking error, rms", "rad/s", lambda run: run.totals.tracking_rms),
+    Figure("dip_rad_s", "worst dip after a load step", "rad/s", _worst("dip")),
+    Figure("recovery_s", "slowest recovery to 0.5 rad/s", "s", _worst("recovery_s")),
+    Figure("rise_s", "slowest rise, 10 to 90 %", "s", _worst("rise_s")),
+    Figure("overshoot_percent", "largest overshoot", "%", _worst("overshoot_percent")),
+    Figure("settling_s", "slowest settling to 2 %", "s", _worst("settling_s")),
+    Figure("estimate_error_n_m", "load estimate off N ticks after a step", "N m", _worst("estimate_error")),
+    Figure("ripple_rad_s", "speed ripple at rest, rms", "rad/s", _worst("ripple")),
+    Figure("iae_rad", "integral of |w − w*|", "rad", lambda run: run.totals.iae),
+    Figure("skipped", "periods skipped", "", lambda run: run.totals.skipped),
+    Figure("dropped", "records dropped", "", _result("dropped_ticks")),
+    Figure("lost_feedback", "ticks in operation without fresh feedback", "", lambda run: run.totals.lost),
+    Figure("crc_errors", "ticks with a CRC error", "", _flag("bus: crc error")),
+    Figure("lateness_p999_us", "lateness, p99.9", "µs", _lateness("p999")),
+    Figure("lateness_max_us", "lateness, largest", "µs", _lateness("max")),
+    Figure("bus_load_percent", "bus load, busiest second", "%", _busiest),
+)
+
+
+def figures(run: Run) -> dict[str, float | None]:
+    """All figures of a run by their keys."""
+    return {figure.key: figure.of(run) for figure in FIGURES}
+
+
+def number(value: float | None, unit: str = "") -> str:
+    """A figure for people."""
+    if value is None:
+        return "–"
+    if value == float("inf"):
+        return "never"
+    whole = float(value).is_integer() and abs(value) < 1e9
+    return (f"{value:.0f}" if whole else f"{value:.4g}") + (f" {unit}" if unit else "")
+
+
+def limits(run: Run) -> dict[str, float]:
+    """What the config demands: figure key to largest value; ``dip_max_rad_s`` limits ``dip_rad_s``."""
+    if run.config is None:
+        return {}
+    given = run.config.criteria.model_dump(exclude_none=True)
+    return {key.replace("_max", "", 1): float(value) for key, value in given.items()}
+
+
+def judge(run: Run) -> list[Check]:
+    """Every check of a run, those that need no config first."""
+    demanded = limits(run)
+    return [*_always(run), *(_limit(run, f, demanded[f.key]) for f in FIGURES if f.key in demanded)]
+
+
+def _limit(run: Run, figure: Figure, most: float) -> Check:
+    value = figure.of(run)
+    outcome: Outcome = "no data" if value is None else "pass" if value <= most else "fail"
+    return Check(figure.name, outcome, number(value, figure.unit), f"at most {number(most, figure.unit)}")
+
+
+def _always(run: Run) -> list[Check]:
+    """Ended as asked, log whole, nothing dropped, replay the same."""
+    asked = run.ended in ("stop_requested", "quick_stop_requested")
+    missing = run.totals.missing
+    whole = run.log.damage is None and bool(run.log.result) and missing == 0
+    found = run.log.damage or (f"{missing} records missing" if missing else "complete")
+    verdict = run.verdict
+    replayed: Outcome = {"same": "pass", "differs": "fail", "cannot": "no data"}[verdict.verdict]  # type: ignore[assignment]
+    return [
+        Check("ended", _outcome(asked), run.ended.replace("_", " "), "stop requested"),
+        Check("log", _outcome(whole), found if run.log.result else f"{found}; no result", "complete"),
+        Check("replay", replayed, verdict_text(run), "same to the bit"),
+    ]
+
+
+def _outcome(good: bool) -> Outcome:
+    return "pass" if good else "fail"
+
+
+def verdict_text(run: Run) -> str:
+    """The replay's verdict in one line."""
+    verdict, first = run.verdict, run.verdict.first_difference
+    text: dict[str, Any] = {"same": f"same, {verdict.ticks} ticks", "cannot": "cannot", "differs": "differs"}
+    line = str(text[verdict.verdict])
+    if first is not None:
+        line += (
+            f" at tick {first.tick}: {first.field} logged {first.logged!r}, replayed {first.replayed!r} "
+            f"({first.ulp} ulp)"
+        )
+    return line + (f"; {verdict.why}" if verdict.why else "")
