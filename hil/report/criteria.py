@@ -10,6 +10,8 @@ from hil.report.collect import Run
 
 Outcome = Literal["pass", "fail", "no data"]
 
+SIGNS: Final[dict[Outcome, str]] = {"pass": "✓ pass", "fail": "✗ fail", "no data": "– no data"}
+
 
 @dataclass(frozen=True, slots=True)
 class Check:

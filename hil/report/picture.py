@@ -1,0 +1,73 @@
+"""The report as one PNG: the curves of the page, minima to maxima, under a line that says the verdict."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any, Final
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from hil.report.collect import Run
+from hil.report.criteria import judge
+from hil.report.curves import KEYS, PLOTS, Plot
+from hil.report.embed import FITTED, is_empty
+
+COLOURS: Final = ("#0b62c4", "#d1570a", "#15803d", "#9333ea", "#b4235a", "#0e7c86", "#7a5c00", "#50555b")
+INCHES: Final = (12.0, 2.0)
+DPI: Final = 100
+
+
+def picture(runs: Sequence[Run]) -> bytes:
+    """PNG bytes; two columns of plots."""
+    plots = [plot for plot in PLOTS if not is_empty(runs, plot)]
+    rows = max(1, -(-len(plots) // 2))
+    with matplotlib.rc_context({"font.size": 8, "axes.grid": True, "grid.color": "#d8dde3"}):
+        figure = Figure(figsize=(INCHES[0], INCHES[1] * rows + 0.6), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle("\n".join(map(_headline, runs)), fontsize=10, parse_math=False)
+        axes = figure.subplots(rows, 2, squeeze=False, sharex=True).ravel()
+        for axis in axes[len(plots) :]:
+            axis.set_visible(False)
+        for axis, plot in zip(axes, plots, strict=False):
+            _draw(axis, plot, runs)
+        out = io.BytesIO()
+        figure.savefig(out, format="png")
+    return out.getvalue()
+
+
+def _headline(run: Run) -> str:
+    checks = judge(run)
+    bad = [f"{check.name}: {check.found}" for check in checks if check.outcome != "pass"]
+    text = f"all {len(checks)} checks passed" if not bad else "not passed: " + ", ".join(bad)
+    return f"{run.name}, {run.span_s:.2f} s: {text}"[:150]
+
+
+def _draw(axis: Any, plot: Plot, runs: Sequence[Run]) -> None:
+    several = len(runs) > 1
+    for index, run in enumerate(runs):
+        t, low, high = run.curves()
+        chosen = [curve for curve in plot.curves if curve.compared or not several]
+        for place, curve in enumerate(chosen):
+            colour = COLOURS[(index if several else place) % len(COLOURS)]
+            row = KEYS.index(curve.key)
+            label = f"{run.name}: {curve.label}" if several else curve.label
+            _envelope(axis, plot, t, low[row], high[row], colour, label[:40])
+    for value, _ in runs[0].lines().get(plot.key, []) if plot.key in FITTED else ():
+        axis.axhline(value, color="#c4231c", linestyle="--", linewidth=0.7)
+    axis.set_title(f"{plot.title} [{plot.unit}]" if plot.unit else plot.title, loc="left", fontsize=8)
+    axis.set_xlabel("t [s]", fontsize=7)
+    if plot.names:
+        axis.set_yticks(range(len(plot.names)), plot.names, fontsize=6)
+    axis.legend(loc="best", fontsize=6, framealpha=0.7)
+
+
+def _envelope(axis: Any, plot: Plot, t: Any, low: Any, high: Any, colour: str, label: str) -> None:
+    """Two points a bin, lowest and highest: a spike of one tick is drawn."""
+    x, y = np.repeat(t, 2), np.stack([low, high], axis=1).ravel()
+    y = np.where(np.isfinite(y), y, np.nan)
+    style = "steps-post" if plot.held else "default"
+    axis.plot(x, y, color=colour, linewidth=0.8, drawstyle=style, label=label)
