@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.bus import BusSettings, open_link
+from drivers.busload import frame_seconds
 from drivers.client import DriveClient, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
@@ -130,6 +131,19 @@ def bus_settings(config: RunConfig) -> BusSettings:
     """The bus table in the drivers' terms."""
     bus = config.bus
     return BusSettings(bus.interface, bus.channel, bus.bitrate, bus.data_bitrate, bus.fd)
+
+
+def frame_time(config: RunConfig) -> Callable[[int, bool], float]:
+    """Longest time on the bus [s] of a frame of so many bytes (True: extended identifier)."""
+    bus = config.bus
+
+    def seconds(length: int, extended: bool) -> float:
+        fd = bus.fd or length > 8
+        return frame_seconds(
+            length, fd=fd, extended=extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
+        )
+
+    return seconds
 
 
 def is_emulated_bus(config: RunConfig) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hil.commands import bench, demo, emulated, log, paper, replay, run
+from hil.commands import bench, demo, emulated, log, paper, replay, report, run
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -17,11 +17,12 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
   hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
+  hil report LOG [LOG ...]     one page of a run that works offline; several are compared
   hil info LOG, recover LOG    what is in a log; rewrite a damaged one
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, emulated, replay, log, paper, bench)
+MODULES = (demo, run, emulated, replay, report, log, paper, bench)
 
 
 def _parser() -> argparse.ArgumentParser:

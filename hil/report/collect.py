@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hil.app import frame_time
 from hil.config import RunConfig, validate
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
@@ -76,6 +77,7 @@ class Run:
             self.config_problem = str(error)
         else:
             windows = machine.law["N"][0]
+            self.frame_time = frame_time(self.config)
             self.N = (int(windows[0]), int(windows[1]))
             self.responses.N = self.N[0]
 

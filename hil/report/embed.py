@@ -53,6 +53,8 @@ def run_data(run: Run) -> dict[str, Any]:
 def is_empty(runs: Sequence[Run], plot: Plot) -> bool:
     """True when no curve of a plot has a number in any run."""
     rows = [KEYS.index(curve.key) for curve in plot.curves]
+    if plot.key == "lateness" and not any(run.phases.lateness.max > 0 for run in runs):
+        return True  # a lockstep run has no lateness
     return not any(np.isfinite(run.envelope.bins()[1][rows]).any() for run in runs)
 
 

@@ -71,6 +71,7 @@
     const ctx = u.ctx, {left, top, width, height} = u.bbox;
     ctx.save();
     ctx.strokeStyle = ctx.fillStyle = colour("bad");
+    ctx.textAlign = "left";
     ctx.setLineDash([5 * devicePixelRatio, 4 * devicePixelRatio]);
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
     for (const [value, name] of lines) {
@@ -145,7 +146,7 @@
       scales: {x: {time: false, range: (u, min, max) => [min, max]}, y: {range: verticalRange(plot)}},
       axes: [
         axis({values: (u, splits) => splits.map(short)}),
-        axis({size: plot.names.length ? 130 : 64, values: plot.names.length
+        axis({size: plot.names.length ? 150 : 64, values: plot.names.length
           ? (u, splits) => splits.map(s => plot.names[s] ?? "") : (u, splits) => splits.map(short),
           ...(plot.names.length ? {splits: () => plot.names.map((_, i) => i)} : {})}),
       ],
@@ -180,7 +181,8 @@
       cursor: {drag: {x: true, y: false}},
       scales: {
         x: {time: false, distr: 3},
-        y: {distr: 3, range: (u, min, max) => max > 0 ? [chart.steps ? 0.5 : min / 2, max * 2] : [0.1, 10]},
+        y: {distr: 3, range: (u, min, max) => max > 0
+          ? [chart.steps ? 0.1 : 10 ** Math.floor(Math.log10(min)), 10 ** Math.ceil(Math.log10(max) + 0.01)] : [0.1, 10]},
       },
       axes: [axis({label: chart.x, labelSize: 18, size: 34}), axis({size: 70, values: (u, s) => s.map(v => v == null ? "" : short(v))})],
       series: [
