@@ -4,24 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.codec import Database
+from drivers.binding import Binding
+from drivers.errors import DatabaseError
 
 OnFrame = Callable[[bool, int, int, bytes], None]
 
 
 class CommandWatch:
-    """Remembers the voltages [V] of each valid COMMAND seen, by its counter."""
+    """Remembers the voltages [V] of each valid command seen, by its counter.
 
-    def __init__(self, database: Database) -> None:
-        self._command = database.message("COMMAND", "Counter", "VoltageQ", "VoltageD")
-        self._read = self._command.reader("Counter", "VoltageQ", "VoltageD")
-        self._by_counter = [(0.0, 0.0)] * self._command.counter_modulus
+    A drive without echo is taken to apply the newest. Raises DatabaseError for u_q and u_d in two messages.
+    """
+
+    def __init__(self, binding: Binding) -> None:
+        bound = binding.command
+        self._message, self._echo = bound.message, bool(binding.map.echo)
+        parts = dict(bound.parts)
+        if "u_d" not in parts:
+            raise DatabaseError("a shadow run needs u_q and u_d in one message; drop --shadow")
+        counter = [bound.counter] if bound.counter else []
+        self._read = self._message.reader(parts["u_q"], parts["u_d"], *counter)
+        self._by_counter = [(0.0, 0.0)] * bound.counter_modulus
+        self._newest = (0.0, 0.0)
 
     def chained(self, after: OnFrame) -> OnFrame:
         """Return what takes note of a frame and hands it on to ``after``."""
 
         def on_frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-            if can_id == self._command.can_id:
+            if can_id == self._message.send_id:
                 self.take(data)
             after(received, t_ns, can_id, data)
 
@@ -29,10 +39,11 @@ class CommandWatch:
 
     def take(self, data: bytes) -> None:
         """Take note of a command, whole and valid or not at all."""
-        if len(data) == self._command.length and self._command.valid(data):
-            counter, u_q, u_d = self._read(data)
-            self._by_counter[int(counter)] = (u_q, u_d)
+        if len(data) == self._message.length and self._message.valid(data):
+            u_q, u_d, *counter = self._read(data)
+            self._newest = (u_q, u_d)
+            self._by_counter[int(counter[0]) if counter else 0] = self._newest
 
     def applied(self, echo: int) -> tuple[float, float]:
         """Voltages of the newest command with that counter; zeros when none was seen."""
-        return self._by_counter[echo % len(self._by_counter)]
+        return self._by_counter[echo % len(self._by_counter)] if self._echo else self._newest

@@ -2,7 +2,8 @@
 
 `lockstep`: each SYNC advances the plant by exactly one period. `realtime`: by the time that really passed;
 a timer advances it when SYNC stays away, so that the watchdog trips. A cyclic drive (no SYNC) samples on its
-own timer. Frames that are not whole, valid and fresh are counted and ignored.
+own timer; its loads begin with the first command. Frames that are not whole, valid and fresh are counted and
+ignored.
 """
 
 from __future__ import annotations
@@ -105,6 +106,11 @@ class Node:
         if self._clock == "realtime" and self._started:
             self._advance_to(time.monotonic_ns())
 
+    def _on_command(self) -> None:
+        """Before a valid command is taken; a cyclic drive's plant stands still until its first."""
+        self._started = self._started or self._pacing == "cyclic"
+        self._catch_up()
+
     def _advance_to(self, now_ns: int) -> None:
         advance(self._params[0], self.state, now_ns - self._last_ns)
         self._last_ns = now_ns
@@ -112,7 +118,7 @@ class Node:
     def take(self, frame: Frame) -> None:
         """Handle one frame, whole or not at all."""
         if frame.can_id | frame.flags != self._frames.sync_id:
-            self._frames.take(frame, self.state, self._catch_up)
+            self._frames.take(frame, self.state, self._on_command)
         elif self._pacing == "sync":
             if len(frame.data) > 1:  # CANopen: no data or the counter
                 self.ignored["length"] += 1
@@ -122,7 +128,7 @@ class Node:
     def sync(self, now_ns: int) -> None:
         """One SYNC (or cycle): advance, latch, sample, answer."""
         if not self._started:
-            self._started = True
+            self._started = self._pacing == "sync"
             self._last_ns = now_ns
         elif self._clock == "lockstep":
             advance(self._params[0], self.state, self._period_ns)

@@ -17,17 +17,19 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, open_link
 from drivers.busload import frame_seconds
 from drivers.client import DriveClient, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
+from drivers.mapping import MEASURED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
 from hil import realtime
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, WireFacts, build
-from hil.errors import ArmingError, HilError
+from hil.errors import ArmingError, ConfigError, HilError
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.loop import Loop, Outcome, Plan, StopRequest
 from hil.ports import Drive
@@ -65,6 +67,7 @@ class Setup:
     path: Path
     config: RunConfig
     database: Database
+    binding: Binding
     wire: WireFacts
     machine: Machine
 
@@ -102,20 +105,23 @@ class RunResult:
         }
 
 
-def wire_facts(database: Database) -> WireFacts:
-    """What the kernel needs of a DBC of the house protocol. Raises DatabaseError."""
-    command = database.message("COMMAND", "Counter", "Controlword", "VoltageQ", "VoltageD")
-    feedback = database.message(
-        "FEEDBACK", "Counter", "Echo", "Speed", "CurrentQ", "CurrentD", "State"
-    ).signals
-    load = database.messages.get("LOAD_COMMAND", command).signals.get("LoadTorque")
-    voltage = command.signals["VoltageQ"]
+def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
+    """The configured map of the drive's signals, else the house protocol's. Raises DatabaseError."""
+    table = config.drive.signals
+    return house_map(database) if table is None else map_from_table(table, f"{where}: drive.signals")
+
+
+def wire_facts(binding: Binding) -> WireFacts:
+    """What the kernel needs of the frames, in SI units."""
+    u_q, load = binding.signal("u_q"), binding.signal("load_torque")
+    measured = [signal for part in MEASURED if (signal := binding.signal(part))]
+    assert u_q is not None and len(measured) == 3  # noqa: S101 - a binding without them is refused
     return WireFacts(
-        u_lsb=voltage.scale,
+        u_lsb=u_q.scale,
         T_L_lsb=load.scale if load else 0.01,
-        counter_modulus=command.counter_modulus,
-        x_lsb=(feedback["Speed"].scale, feedback["CurrentQ"].scale, feedback["CurrentD"].scale),
-        u_top=voltage.top,
+        counter_modulus=binding.counter_modulus,
+        x_lsb=(measured[0].scale, measured[1].scale, measured[2].scale),
+        u_top=u_q.top,
     )
 
 
@@ -123,8 +129,22 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     """Load and check everything of a run without opening or sending anything."""
     config = load_toml(path, RunConfig, overrides.as_settings())
     database = Database(path.parent / config.drive.dbc, config.drive.node_id)
-    wire = wire_facts(database)
-    return Setup(path, config, database, wire, build(config, wire))
+    load = config.controller.kind == "fac"
+    period_ms = config.loop.period_ns * 1e-6
+    binding = bind(drive_map(config, database, str(path)), database, load=load, period_ms=period_ms)
+    _check_pacing(path, config, binding)
+    wire = wire_facts(binding)
+    return Setup(path, config, database, binding, wire, build(config, wire))
+
+
+def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
+    """A drive that takes no SYNC can't be paced by it. Raises ConfigError."""
+    if binding.sync is None and config.loop.clock == "lockstep":
+        raise ConfigError(str(path), ['loop.clock: a drive without SYNC keeps its own time; take "realtime"'])
+    if binding.sync is None and config.loop.pacing == "sync":
+        raise ConfigError(
+            str(path), ['loop.pacing: the drive takes no SYNC (drive.signals has no sync); take "feedback"']
+        )
 
 
 def bus_settings(config: RunConfig) -> BusSettings:
@@ -232,6 +252,7 @@ def opened_client(
         link,
         setup.database,
         load=setup.config.controller.kind == "fac",
+        drive_map=setup.binding.map,
         on_frame=watch.chained(on_frame) if watch else on_frame,
         now=clock.now_ns,
     )
@@ -270,7 +291,7 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
     recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
     try:
-        watch = CommandWatch(setup.database) if config.loop.shadow else None
+        watch = CommandWatch(setup.binding) if config.loop.shadow else None
         with opened_client(setup, recorder, clock, watch) as client:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             _await_drive(setup, client)

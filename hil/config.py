@@ -136,6 +136,8 @@ class DriveTable(Table):
     dbc: str
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     heartbeat_timeout_s: Positive = 3.0
+    signals: dict[str, Any] | None = None
+    """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""
 
 
 class ChannelTable(Table):

@@ -16,6 +16,10 @@ from hil.signals import DriveState, Reason, Request, RxFlag, TickArray
 Pacing = Literal["sync", "feedback", "timer"]
 Step = Callable[[TickArray], None]
 MAX_NS = 2**31 - 1
+NO_WAIT = 1
+"""A deadline that has long passed: one feedback if it is there already."""
+QUEUE_MOST = 4096
+"""Queued feedback that one tick takes; a flood can't hold it longer."""
 
 
 class StopRequest:
@@ -95,7 +99,7 @@ class Loop:
             deadline_ns = start_ns + k * plan.period_ns
             now_ns = clock.sleep_until(deadline_ns) if plan.pacing != "feedback" else clock.now_ns()
             k, gap = self._skip(k, deadline_ns, now_ns)
-            self._one(tick, k, start_ns + k * plan.period_ns, gap, now_ns)
+            k = self._one(tick, k, start_ns + k * plan.period_ns, gap, now_ns)
             outcome.ticks += 1
             if self._ended(tick, k):
                 return
@@ -111,12 +115,15 @@ class Loop:
         self._outcome.skipped += skipped
         return k + skipped, 1 + skipped
 
-    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
-        """Read, judge, compute, write, record."""
+    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> int:
+        """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on."""
         clock = self._clock
         self._stamp(tick, k, deadline_ns, gap, now_ns)
         tick["rx_flags"] = 0
-        self._exchange(tick, deadline_ns)
+        if self._plan.pacing == "feedback":
+            k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
+        else:
+            self._exchange(tick, deadline_ns)
         tick["received_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
         self._prepare(self._ticks)
         self._step(self._ticks)
@@ -129,6 +136,29 @@ class Loop:
             self._recorder.event(deadline_ns, k, *transition_event(self._state, int(tick["reason"])))
         self._recorder.tick(self._ticks)
         tick["recorded_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
+        return k
+
+    def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
+        """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
+
+        Each feedback is one period of the drive's clock. Returns k and its deadline.
+        """
+        plan, drive, fresh = self._plan, self._drive, int(RxFlag.FRESH)
+        wait_ns = plan.period_ns * 3 // 2
+        drive.receive(tick, self._clock.receive_deadline(self._clock.now_ns(), wait_ns))
+        heard = 0
+        while int(tick["rx_flags"]) & fresh and heard < QUEUE_MOST:
+            heard += 1
+            tick["rx_flags"] = int(tick["rx_flags"]) & ~fresh
+            drive.receive(tick, NO_WAIT)
+        skipped = max(heard - 1, 0) if k else 0
+        if heard:
+            tick["rx_flags"] = int(tick["rx_flags"]) | fresh
+        if skipped:
+            k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
+            self._stamp(tick, k, deadline_ns, 1 + skipped, self._clock.now_ns())
+            self._outcome.skipped += skipped
+        return k, deadline_ns
 
     def _stamp(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         tick["k"] = k
@@ -146,7 +176,7 @@ class Loop:
         return self._request.value
 
     def _exchange(self, tick: Any, deadline_ns: int) -> None:
-        """SYNC out and feedback in (sync), or feedback alone (feedback, timer)."""
+        """SYNC out and feedback in (sync), or what has come (timer)."""
         plan, drive = self._plan, self._drive
         if plan.pacing == "timer":
             drive.receive(tick, 0)
@@ -158,8 +188,6 @@ class Loop:
                 tick["rx_flags"] |= int(RxFlag.BUS_DOWN)
                 return
             drive.receive(tick, self._clock.receive_deadline(deadline_ns, plan.timeout_ns))
-            return
-        drive.receive(tick, self._clock.receive_deadline(self._clock.now_ns(), plan.period_ns * 3 // 2))
 
     def _send(self, tick: Any) -> None:
         """Send the command; a bus that does not take it is seen by the supervisor in the next tick."""
