@@ -80,6 +80,7 @@ class Loop:
         self._prepare, self._step = prepare, step
         self._ticks, self._plan, self._request = ticks, plan, request
         self._outcome = Outcome()
+        self._arrived_ns = 0
         self._state = int(DriveState.SWITCH_ON_DISABLED)
 
     def run(self) -> Outcome:
@@ -141,7 +142,8 @@ class Loop:
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
         """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
 
-        Each feedback is one period of the drive's clock. Returns k and its deadline.
+        Each feedback is one period of the drive's clock; lateness is then how much later it came than one
+        period after the last. Returns k and its deadline.
         """
         plan, drive, fresh = self._plan, self._drive, int(RxFlag.FRESH)
         wait_ns = plan.period_ns * 3 // 2
@@ -156,8 +158,11 @@ class Loop:
             tick["rx_flags"] = int(tick["rx_flags"]) | fresh
         if skipped:
             k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
-            self._stamp(tick, k, deadline_ns, 1 + skipped, self._clock.now_ns())
             self._outcome.skipped += skipped
+        now_ns = self._clock.now_ns()
+        expected_ns = self._arrived_ns + (1 + skipped) * plan.period_ns if k else now_ns
+        self._stamp(tick, k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
+        self._arrived_ns = now_ns
         return k, deadline_ns
 
     def _stamp(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
@@ -165,7 +170,7 @@ class Loop:
         tick["t_ns"] = deadline_ns
         tick["gap"] = gap
         tick["skipped"] = gap - 1
-        tick["lateness_ns"] = min(now_ns - deadline_ns, MAX_NS)
+        tick["lateness_ns"] = max(min(now_ns - deadline_ns, MAX_NS), -MAX_NS)
         tick["request"] = self._requested(k)
         tick["log_failed"] = self._recorder.failed
 

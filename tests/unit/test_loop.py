@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from hil.clock import FakeClock, LockstepClock, RealClock
-from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 
 MS = 1_000_000
@@ -159,10 +159,35 @@ def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:
     assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"]
 
 
+class CyclicDrive(ScriptedDrive):
+    """Of feedback that comes by the drive's clock: how many lie in the queue at each wait."""
+
+    def __init__(self, queued: list[int]) -> None:
+        super().__init__()
+        self._later, self._now = queued, 0
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        if deadline_ns > NO_WAIT:
+            self._note("receive")
+            self._now = self._later.pop(0) if self._later else 1
+        if self._now:
+            self._now -= 1
+            tick["rx_flags"] |= int(RxFlag.FRESH)
+
+
 def test_feedback_pacing_is_woken_by_the_drive() -> None:
-    drive, slept = ScriptedDrive(), []
+    drive, slept = CyclicDrive([]), []
     make(drive, FakeClock(on_sleep=slept.append), ticks=2, pacing="feedback")[0].run()
     assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"] and slept == []
+
+
+def test_of_queued_feedback_the_newest_counts_and_the_others_are_skipped() -> None:
+    loop, memory, _ = make(CyclicDrive([5, 1, 4, 0, 1]), FakeClock(), ticks=9, pacing="feedback")
+    outcome = loop.run()
+    seen = [(int(t["k"][0]), int(t["gap"][0]), int(t["rx_flags"][0] & RxFlag.FRESH)) for t in memory.ticks]
+    assert seen[:5] == [(0, 1, 1), (1, 1, 1), (5, 4, 1), (6, 1, 0), (7, 1, 1)]
+    assert outcome.skipped == 3
+    assert int(memory.ticks[2]["t_ns"][0]) == 5 * MS
 
 
 def test_stop_asked_twice_is_a_quick_stop() -> None:
