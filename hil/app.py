@@ -130,8 +130,9 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     config = load_toml(path, RunConfig, overrides.as_settings())
     database = Database(path.parent / config.drive.dbc, config.drive.node_id)
     load = config.controller.kind == "fac"
-    period_ms = config.loop.period_ns * 1e-6
-    binding = bind(drive_map(config, database, str(path)), database, load=load, period_ms=period_ms)
+    parts = drive_map(config, database, str(path))
+    period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
+    binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
     wire = wire_facts(binding)
     return Setup(path, config, database, binding, wire, build(config, wire))
