@@ -47,7 +47,11 @@ class Run:
     _state: int = int(DriveState.SWITCH_ON_DISABLED)
 
     def feed(self, ticks: TickArray) -> None:
-        """Take the next ticks."""
+        """Take the next ticks; what is no number in them is shown as that, not warned of."""
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            self._feed(ticks)
+
+    def _feed(self, ticks: TickArray) -> None:
         if self.first_ns is None:
             self.begin(ticks)
         t: F8 = (ticks["t_ns"].astype(np.int64) - (self.first_ns or 0)).astype(np.float64) * 1e-9
@@ -147,7 +151,8 @@ def collect(path: Path, *, verify: bool = True) -> Run:
             run.feed(block.records)
         else:
             run.frames.feed(block.records)
-    run.responses.finish()
+    with np.errstate(invalid="ignore", over="ignore"):
+        run.responses.finish()
     if run.config is None and not run.config_problem:  # there was no tick
         run.read_config()
     if verify:

@@ -140,7 +140,9 @@
     const u = new uPlot({
       width: card.clientWidth, height: CURVE_HEIGHT,
       cursor: {
-        sync: {key: "time", setSeries: false}, drag: {x: true, y: false, setScale: false}, points: {size: 5},
+        // The others follow the pointer, but only the plot that was dragged across sets the range.
+        sync: {key: "time", setSeries: false, filters: {pub: kind => !["mousedown", "mouseup"].includes(kind)}},
+        drag: {x: true, y: false, setScale: false}, points: {size: 5},
         bind: {dblclick: () => reset},
       },
       scales: {x: {time: false, range: (u, min, max) => [min, max]}, y: {range: verticalRange(plot)}},
