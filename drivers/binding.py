@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
 from drivers.codec import Database, Message
 from drivers.errors import DatabaseError, EncodeError
@@ -38,6 +38,8 @@ class Binding:
     sync: Message | None
     emergency: Message | None
     heartbeat: Message | None
+    factors: Mapping[str, float] = field(default_factory=dict)
+    """From the DBC's unit of each part to SI, where they differ."""
 
     def signal(self, part: str) -> Signal | None:
         """The signal of a part, in SI units; None when the drive has none."""
@@ -46,6 +48,12 @@ class Binding:
                 if name == part:
                     return bound.message.signals[signal]
         return None
+
+    @property
+    def counters(self) -> dict[str, str]:
+        """The counter of each message that has one, by message name."""
+        bounds = self.incoming + self.outgoing
+        return {bound.message.name: bound.counter for bound in bounds if bound.counter}
 
     @property
     def command(self) -> Bound:
@@ -71,6 +79,7 @@ class _Binder:
     def __init__(self, drive: DriveMap, database: Database, load: bool, period_ms: float | None) -> None:
         self._map, self._database, self._period_ms = drive, database, period_ms
         self._mistakes: list[str] = []
+        self._factors: dict[str, float] = {}
         self._counters = dict(self._pairs("counters", drive.counters))
         skipped = () if load else ("load_torque", "load_enable")
         self._received = self._places(RECEIVED, ())
@@ -100,15 +109,16 @@ class _Binder:
         outgoing = self._bounds(self._sent, SENT)
         last = self._sent.get("u_q", ("", ""))[0]
         outgoing.sort(key=lambda bound: bound.message.name == last)
-        others = [
+        sync, emergency, heartbeat = (
             self._message(getattr(self._map, name), name) for name in ("sync", "emergency", "heartbeat")
-        ]
+        )
         self._check_whole()
         self._check_periods(incoming)
         self._check_zero(outgoing)
         if self._mistakes:
             raise DatabaseError(f"{self._database.path}: " + "; ".join(self._mistakes))
-        return Binding(self._map, tuple(incoming), tuple(outgoing), *others)
+        ins, outs = tuple(incoming), tuple(outgoing)
+        return Binding(self._map, ins, outs, sync, emergency, heartbeat, self._factors)
 
     def _message(self, name: str, part: str, *signals: str) -> Message | None:
         """The message, or None with the mistake noted."""
@@ -168,7 +178,7 @@ class _Binder:
             known = ", ".join(rule.units)
             self._add(f"{part}: {where} has the unit {signal.unit!r}; give it one of {known} in the DBC")
             return signal
-        factor = rule.units[signal.unit]
+        factor = self._factors[part] = rule.units[signal.unit]
         return signal if factor == 1.0 else signal.in_unit(next(iter(rule.units)), factor)
 
     def _checked_counter(self, message: Message) -> str:

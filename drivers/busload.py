@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from drivers.binding import Binding
+from drivers.codec import Message
+from drivers.mapping import MEASURED
+
 FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 
@@ -41,3 +45,33 @@ def frame_seconds(
 def bus_load(frames: Iterable[tuple[float, float]]) -> float:
     """Share of the bus's time that (seconds per frame, frames per second) take together, 0 .. 1 and over."""
     return sum(seconds * rate for seconds, rate in frames)
+
+
+def message_rates(binding: Binding, rate_hz: float) -> list[tuple[Message, float]]:
+    """How often each message of the map is on the bus [1/s], the loop running at ``rate_hz``.
+
+    SYNC, commands and measurements once a tick; others by the DBC's cycle time, which for a drive that
+    takes SYNC counts in SYNCs; heartbeats by their cycle time alone. Without a cycle time: not counted.
+    """
+    sync, beat = binding.sync, binding.heartbeat
+    stretch = rate_hz * sync.cycle_ms / 1000.0 if sync and sync.cycle_ms else 1.0
+    rates = [(bound.message, rate_hz) for bound in binding.outgoing]
+    rates += [(sync, rate_hz)] if sync else []
+    for bound in binding.incoming:
+        if any(part in MEASURED for part, _ in bound.parts):
+            rates.append((bound.message, rate_hz))
+        elif bound.message.cycle_ms:
+            rates.append((bound.message, 1000.0 / bound.message.cycle_ms * stretch))
+    return rates + ([(beat, 1000.0 / beat.cycle_ms)] if beat and beat.cycle_ms else [])
+
+
+def message_shares(
+    rates: Iterable[tuple[Message, float]], bitrate: int, data_bitrate: int | None = None
+) -> dict[str, float]:
+    """Worst-case share of the bus's time that each message takes, by name, the largest first."""
+    shares = {
+        m.name: rate
+        * frame_seconds(m.length, fd=m.fd, extended=m.extended, bitrate=bitrate, data_bitrate=data_bitrate)
+        for m, rate in rates
+    }
+    return dict(sorted(shares.items(), key=lambda pair: -pair[1]))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from drivers.binding import Binding
 from drivers.bus import Frame, Link
 from drivers.codec import Database, Message
 from drivers.errors import LinkDown, LinkError
+from drivers.local import ERR_FLAG
+from drivers.states import translator
 
 
 @dataclass(slots=True)
@@ -43,9 +46,9 @@ class Traffic:
         return self.messages.get(name, Heard())
 
 
-def listen(link: Link, database: Database, seconds: float) -> Traffic:
-    """Listen for ``seconds``; a bus that goes down ends it early."""
-    by_id = {message.can_id: message for message in database.messages.values()}
+def listen(link: Link, database: Database, seconds: float, counters: Mapping[str, str]) -> Traffic:
+    """Listen for ``seconds``; a bus that goes down ends it early. ``counters``: signal by message."""
+    by_id = {message.send_id: message for message in database.messages.values()}
     traffic = Traffic()
     end = time.monotonic_ns() + round(seconds * 1e9)
     while (left := end - time.monotonic_ns()) > 0 and not traffic.down:
@@ -57,32 +60,44 @@ def listen(link: Link, database: Database, seconds: float) -> Traffic:
             traffic.error_frames += 1
         else:
             if frame is not None:
-                _take(traffic, frame, by_id.get(frame.can_id), time.monotonic_ns())
+                _take(traffic, frame, by_id.get(frame.can_id | frame.flags), counters, time.monotonic_ns())
     return traffic
 
 
-def _take(traffic: Traffic, frame: Frame, message: Message | None, now_ns: int) -> None:
-    if frame.flags and not (message and message.extended):
+def _take(
+    traffic: Traffic, frame: Frame, message: Message | None, counters: Mapping[str, str], now_ns: int
+) -> None:
+    if frame.flags & ERR_FLAG:
         traffic.error_frames += 1
     elif message is None:
         traffic.foreign += 1
     else:
-        _count(traffic.messages.setdefault(message.name, Heard()), message, frame.data, now_ns)
+        heard = traffic.messages.setdefault(message.name, Heard())
+        _count(heard, message, counters.get(message.name, ""), frame.data, now_ns)
 
 
-def _count(heard: Heard, message: Message, data: bytes, now_ns: int) -> None:
+def _count(heard: Heard, message: Message, counter: str, data: bytes, now_ns: int) -> None:
     heard.count += 1
     heard.first_ns = heard.first_ns or now_ns
     heard.last_ns = now_ns
     if len(data) != message.length or not message.valid(data):
         heard.invalid += 1
         return
-    before = heard.values.get("Counter")
+    before = heard.values.get(counter)
     heard.values = dict(message.decode(data))
-    if before is not None and message.profile:
-        heard.jumps += heard.values["Counter"] != (before + 1) % message.counter_modulus
+    if before is not None:
+        heard.jumps += heard.values[counter] != (before + 1) % (1 << message.signals[counter].length)
 
 
-def occupied(database: Database, rates_hz: Iterable[tuple[str, float]]) -> list[tuple[Message, float]]:
-    """Messages of the DBC with the rates they are sent at; names that it does not have are left out."""
-    return [(database.messages[name], rate) for name, rate in rates_hz if name in database.messages]
+def part_values(binding: Binding, traffic: Traffic) -> dict[str, float]:
+    """Newest value of each received part that was heard, in SI units; the state as CiA 402's code."""
+    translate = translator(binding.map.states, lambda: 0)
+    values: dict[str, float] = {}
+    for bound in binding.incoming:
+        heard = traffic.of(bound.message.name).values
+        for part, signal in bound.parts:
+            if signal in heard:
+                values[part] = heard[signal] * binding.factors.get(part, 1.0)
+    if translate and "state" in values:
+        values["state"] = translate(int(values["state"]))
+    return values

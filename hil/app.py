@@ -19,10 +19,11 @@ from typing import Any
 
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, open_link
-from drivers.busload import frame_seconds
+from drivers.busload import frame_seconds, message_rates, message_shares
 from drivers.client import DriveClient, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
+from drivers.kernel import interface_facts
 from drivers.mapping import MEASURED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
 from hil import realtime
@@ -37,6 +38,8 @@ from hil.progress import say, watching
 from hil.shadow import ShadowDrive
 from hil.signals import Reason, new_ticks
 
+MAX_LOAD = 0.7
+LOAD_REMEDY = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
 EMULATED_INTERFACES = ("hil-local", "virtual")
 
 
@@ -168,8 +171,18 @@ def frame_time(config: RunConfig) -> Callable[[int, bool], float]:
 
 
 def is_emulated_bus(config: RunConfig) -> bool:
-    """True for buses that no real drive hangs on: hil-local, python-can's virtual, vcan."""
-    return config.bus.interface in EMULATED_INTERFACES or config.bus.channel.startswith("vcan")
+    """True for buses that no real drive hangs on: hil-local, python-can's virtual, vcan by the kernel's word.
+
+    An interface that is not there is taken by its name; nothing can be armed on it anyway.
+    """
+    bus = config.bus
+    if bus.interface != "socketcan":
+        return bus.interface in EMULATED_INTERFACES
+    try:
+        facts = interface_facts(bus.channel)
+    except DriverError:
+        return False  # nobody can say, so it may be real
+    return facts.kind == "vcan" if facts else bus.channel.startswith("vcan")
 
 
 def log_path(setup: Setup, kind: str) -> Path:
@@ -275,6 +288,26 @@ def check_arming(setup: Setup, arm: bool) -> None:
     )
 
 
+def load_found(setup: Setup) -> tuple[str, bool]:
+    """Worst-case bus load of this run in words, with the frames that make it, and whether it is allowed."""
+    bus = setup.config.bus
+    rates = message_rates(setup.binding, float(setup.config.loop.rate_hz))
+    shares = message_shares(rates, bus.bitrate, bus.data_bitrate)
+    load = sum(shares.values())
+    frames = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
+    words = f"{100 * load:.0f} % at {bus.bitrate} bit/s with every stuff bit, without other nodes: {frames}"
+    return words, load <= MAX_LOAD
+
+
+def check_load(setup: Setup) -> None:
+    """Refuse to overload a real bus; an emulated one has no bitrate. Raises ArmingError."""
+    if setup.config.loop.shadow or is_emulated_bus(setup.config):
+        return
+    found, good = load_found(setup)
+    if not good:
+        raise ArmingError(f"bus load {found}; nothing was sent; {LOAD_REMEDY}")
+
+
 def needed_bytes(config: RunConfig) -> int:
     """Disk space that a run of the configured length may take, at least one minute's."""
     seconds = config.loop.duration_s or 60.0
@@ -284,6 +317,7 @@ def needed_bytes(config: RunConfig) -> int:
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
     """Arm and run a configuration; returns after a safe stop. Raises HilError before anything is sent."""
     check_arming(setup, arm)
+    check_load(setup)
     request = request or StopRequest()
     config = setup.config
     setup.machine.warm_up()

@@ -2,24 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from rich.markup import escape
 from rich.table import Table
 
+from drivers.binding import Binding
 from drivers.bus import open_link
-from drivers.busload import bus_load, frame_seconds
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import InterfaceFacts, interface_facts
-from drivers.listen import Heard, Traffic, listen, occupied
-from hil.app import Setup, bus_settings, is_emulated_bus, log_path, needed_bytes
+from drivers.listen import Heard, Traffic, listen, part_values
+from drivers.mapping import MEASURED
+from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
 from hil.preflight import Row, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
 
 PROTOCOL_VERSION = 1
-MAX_LOAD = 0.7
 MAX_QUEUE = 32
 RATE_TOLERANCE = 0.1
-STATUS_EVERY = 10
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
 FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
@@ -117,33 +118,10 @@ def _fd_row(facts: InterfaceFacts, bus: BusTable) -> Row:
     return row("CAN FD", good, found, remedy)
 
 
-def message_rates(setup: Setup) -> list[tuple[str, float]]:
-    """How often each message of the house protocol is on the bus [1/s]; heartbeats by the DBC."""
-    rate = float(setup.config.loop.rate_hz)
-    rates = [("FEEDBACK", rate), ("COMMAND", rate), ("STATUS", rate / STATUS_EVERY)]
-    if setup.config.loop.pacing == "sync":
-        rates.append(("SYNC", rate))
-    if setup.config.controller.kind == "fac":
-        rates.append(("LOAD_COMMAND", rate))
-    beat = setup.database.messages.get("HEARTBEAT")
-    return rates + ([("HEARTBEAT", 1000.0 / beat.cycle_ms)] if beat and beat.cycle_ms else [])
-
-
 def load_row(setup: Setup) -> Row:
     """Worst-case bus load of this run; other nodes' frames come on top."""
-    bus = setup.config.bus
-    load = bus_load(
-        (
-            frame_seconds(
-                m.length, fd=m.fd, extended=m.extended, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate
-            ),
-            rate,
-        )
-        for m, rate in occupied(setup.database, message_rates(setup))
-    )
-    found = f"{100 * load:.0f} % at {bus.bitrate} bit/s with every stuff bit, without other nodes"
-    remedy = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
-    return row("bus load", load <= MAX_LOAD, found, remedy)
+    found, good = load_found(setup)
+    return row("bus load", good, found, LOAD_REMEDY)
 
 
 def heard_rows(setup: Setup) -> list[Row]:
@@ -154,7 +132,7 @@ def heard_rows(setup: Setup) -> list[Row]:
     except LinkError as error:
         return [Row("drive", "fail", str(error), "bring the interface up, then check again")]
     try:
-        traffic = listen(link, setup.database, config.drive.heartbeat_timeout_s)
+        traffic = listen(link, setup.database, config.drive.heartbeat_timeout_s, setup.binding.counters)
     finally:
         link.close()
     return traffic_rows(setup, traffic)
@@ -164,26 +142,33 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
     """Rows about what was heard."""
     config = setup.config
     silent_ok = config.loop.pacing == "sync"
-    feedback, status = traffic.of("FEEDBACK"), traffic.of("STATUS")
-    rows = [
-        drive_row(traffic, config.drive.heartbeat_timeout_s),
-        feedback_row(feedback, config.loop.rate_hz, silent_ok),
-        frames_row(traffic),
-        others_row(traffic),
-    ]
-    values = status.values | feedback.values
+    values = part_values(setup.binding, traffic)
     return [
-        *rows,
-        state_row(traffic, values),
-        version_row(values, silent_ok),
+        drive_row(traffic, setup.binding, config.drive.heartbeat_timeout_s),
+        *feedback_rows(setup, traffic, silent_ok),
+        frames_row(traffic),
+        others_row(traffic, setup.binding),
+        state_row(traffic, setup.binding, values),
+        *version_rows(setup, traffic, silent_ok),
         motion_row(values, config.limits, silent_ok),
-        supply_row(values, config.limits, silent_ok),
+        *([supply_row(values, config.limits, silent_ok)] if setup.binding.map.v_dc else []),
     ]
 
 
-def drive_row(traffic: Traffic, seconds: float) -> Row:
+def feedback_rows(setup: Setup, traffic: Traffic, silent_ok: bool) -> list[Row]:
+    """One row for each message with measurements."""
+    rate_hz, parts = setup.config.loop.rate_hz, setup.binding.incoming
+    names = [b.message.name for b in parts if any(part in MEASURED for part, _ in b.parts)]
+    rows = [feedback_row(traffic.of(name), rate_hz, silent_ok) for name in names]
+    if len(rows) == 1:
+        return rows
+    return [replace(r, check=f"{r.check} {name}") for name, r in zip(names, rows, strict=True)]
+
+
+def drive_row(traffic: Traffic, binding: Binding, seconds: float) -> Row:
     """Is there a drive at all."""
-    names = [name for name in ("HEARTBEAT", "FEEDBACK", "STATUS") if traffic.of(name).count]
+    messages = [binding.heartbeat, *(bound.message for bound in binding.incoming)]
+    names = [message.name for message in messages if message and traffic.of(message.name).count]
     remedy = "is it powered, wired and terminated; are node id and bitrate right?"
     if traffic.down:
         return Row("drive", "fail", "the bus went down while listening", remedy)
@@ -212,30 +197,45 @@ def frames_row(traffic: Traffic) -> Row:
     return row("frames", good, found, "is the DBC the drive's own; wiring, termination, a second drive?")
 
 
-def others_row(traffic: Traffic) -> Row:
+def others_row(traffic: Traffic, binding: Binding) -> Row:
     """Does somebody else command the drive."""
-    names = [name for name in ("SYNC", "COMMAND", "LOAD_COMMAND") if traffic.of(name).count]
+    messages = [binding.sync, *(bound.message for bound in binding.outgoing)]
+    names = [message.name for message in messages if message and traffic.of(message.name).count]
     found = f"{', '.join(names)} heard" if names else "none heard"
     remedy = "stop it before arming; hil run --shadow may run beside it"
     return row("other controller", not names, found, remedy, "warn")
 
 
-def state_row(traffic: Traffic, values: dict[str, float]) -> Row:
+def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> Row:
     """State of the drive, from feedback or else from its heartbeat."""
     remedy = "clear the drive's fault and its cause first"
-    if "State" in values:
-        state, error = DriveState(int(values["State"])), int(values.get("ErrorCode", 0))
+    if "state" in values:
+        state, error = DriveState(int(values["state"])), int(values.get("error", 0))
         found = state.name.lower().replace("_", " ") + (f", error 0x{error:04X}" if error else "")
         if state == DriveState.OPERATION_ENABLED:
             return Row("drive state", "warn", found, "somebody has enabled it; disable it before arming")
         return row("drive state", state not in FAULTS and not error, found, remedy)
-    beat = traffic.of("HEARTBEAT").values.get("NmtState")
+    beat = _nmt_state(traffic, binding)
     if beat is None:
         return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
     found = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"
-    if values.get("ErrorCode"):
-        return Row("drive state", "fail", f"{found}, error 0x{int(values['ErrorCode']):04X}", remedy)
+    if values.get("error"):
+        return Row("drive state", "fail", f"{found}, error 0x{int(values['error']):04X}", remedy)
     return row("drive state", beat == 5, found, "set the drive operational (NMT start)", "warn")
+
+
+def _nmt_state(traffic: Traffic, binding: Binding) -> float | None:
+    """What a CANopen heartbeat, a single signal, says; None for no heartbeat or one of another form."""
+    heard = traffic.of(binding.heartbeat.name).values if binding.heartbeat else {}
+    return next(iter(heard.values())) if len(heard) == 1 else None
+
+
+def version_rows(setup: Setup, traffic: Traffic, silent_ok: bool) -> list[Row]:
+    """The house protocol's version; a drive with a map of its own has none that is known."""
+    if setup.config.drive.signals is not None:
+        return []
+    heard = [traffic.of(bound.message.name).values for bound in setup.binding.incoming]
+    return [version_row({name: v for values in heard for name, v in values.items()}, silent_ok)]
 
 
 def version_row(values: dict[str, float], silent_ok: bool) -> Row:
@@ -249,9 +249,9 @@ def version_row(values: dict[str, float], silent_ok: bool) -> Row:
 
 def motion_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -> Row:
     """Are speed and currents plausible before arming."""
-    if "Speed" not in values:
+    if "speed" not in values:
         return _unseen("speed and current", silent_ok)
-    w, i = values["Speed"], max(abs(values.get("CurrentQ", 0.0)), abs(values.get("CurrentD", 0.0)))
+    w, i = values["speed"], max(abs(values.get("i_q", 0.0)), abs(values.get("i_d", 0.0)))
     found = f"{w:.2f} rad/s of {limits.w_max_rad_s:g}, {i:.2f} A of {limits.i_max_a:g}"
     good = abs(w) < limits.w_max_rad_s and i < limits.i_max_a
     return row("speed and current", good, found, "sensor scale or offset, DBC, limits")
@@ -259,10 +259,10 @@ def motion_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -
 
 def supply_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -> Row:
     """Are DC link and temperatures within the limits."""
-    if "DcLinkVoltage" not in values:
+    if "v_dc" not in values:
         return _unseen("supply and heat", silent_ok)
-    v = values["DcLinkVoltage"]
-    hot = max(values.get("TemperatureMotor", 0.0), values.get("TemperatureInverter", 0.0))
+    v = values["v_dc"]
+    hot = max(values.get("temperature_motor", 0.0), values.get("temperature_inverter", 0.0))
     found = f"{v:.1f} V of {limits.v_dc_min_v:g} .. {limits.v_dc_max_v:g}, {hot:.0f} degC"
     good = limits.v_dc_min_v <= v <= limits.v_dc_max_v and hot < limits.temperature_max_c
     return row("supply and heat", good, found, "switch on the DC link, let it cool, or correct [limits]")

@@ -207,7 +207,7 @@ def test_damaged_frames_and_counter_jumps_on_a_bus(configs: Path, settings: Sett
         bus.send(can.Message(arbitration_id=0x181, data=bytes(3), is_extended_id=False))
         bus.send(can.Message(arbitration_id=0x555, data=bytes(3), is_extended_id=False))
         bus.send(can.Message(is_error_frame=True, is_extended_id=False))
-        traffic = listen(link, setup.database, 0.2)
+        traffic = listen(link, setup.database, 0.2, setup.binding.counters)
     link.close()
     heard = traffic.of("FEEDBACK")
     assert (heard.count, heard.invalid, heard.jumps) == (7, 2, 2)
