@@ -8,7 +8,7 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/unit/test_guard.py tests/unit/test_supervisor.py tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: demo test lint unit interpreted vm clean help
+.PHONY: gallery demo test lint unit interpreted vm clean help
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -38,6 +38,9 @@ interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage
 
 vm: $(STAMP) ## the tests on a real SocketCAN bus (natively or in the bench machine)
 	HIL_REQUIRE_VM=1 $(BIN)/python -m pytest -m vm tests/vm
+
+gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
+	$(BIN)/python docs/gallery/make.py
 
 clean: ## remove the virtual environment and caches
 	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis
