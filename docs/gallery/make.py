@@ -47,9 +47,10 @@ def table(page: Page, folder: Path, name: str) -> None:
     result["log"] = Path(result["log"]).name
     console = Console(width=110, record=True, file=(folder / "discarded").open("w"))
     console.print(demo_table(result))
-    (folder / "table.svg").write_text(console.export_svg(title="hil demo --lockstep"))
-    page.open(folder / "table.svg")
-    page.picture(OUT / "demo.png", clip=(0, 0, 1300, 560))
+    svg = console.export_svg(title="hil demo --lockstep")
+    (folder / "table.html").write_text(f"<!doctype html><title>demo</title>{svg}", encoding="utf-8")
+    page.open(folder / "table.html")
+    page.picture(OUT / "demo.png", clip=page.box("svg"))
 
 
 def shot(page: Page, report: Path, picture: str, selector: str, script: str = "true") -> None:
