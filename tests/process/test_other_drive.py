@@ -17,7 +17,7 @@ from drivers.errors import DatabaseError
 from firmware_model.config import PlantConfig, build_params, new_state
 from firmware_model.inverter import InverterFrames, int24
 from firmware_model.plant import State
-from hil.app import Overrides, check_load, load_setup
+from hil.app import Overrides, check_load, load_setup, run
 from hil.config import load_toml
 from hil.demo import emulator_process
 from hil.errors import ArmingError, ConfigError
@@ -58,12 +58,12 @@ def test_a_drive_that_dies_stops_the_run(patient: Path, settings: Settings) -> N
     own = settings("loop.duration_s=60.0", "drive.heartbeat_timeout_s=10.0")
     with (
         emulator_process(patient, Overrides(settings=own)) as pid,
-        hil("run", str(patient), "--json", *flags(own)) as run,
+        hil("run", str(patient), "--json", *flags(own)) as process,
     ):
         wait_for_log(patient.parent.parent)
         os.kill(pid, signal.SIGKILL)
-        out, errors = run.communicate(timeout=60)
-    assert run.returncode == 1, errors
+        out, errors = process.communicate(timeout=60)
+    assert process.returncode == 1, errors
     ended = json.loads(out)["ended"]
     assert Reason[ended.upper()] not in (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED), ended
 
@@ -119,7 +119,7 @@ def test_a_real_bus_is_not_overloaded(bitrate: int, refused: bool) -> None:
     if not refused:
         return check_load(setup)
     with pytest.raises(ArmingError, match=r"MotorState \d+ %.*nothing was sent.*under 70 %"):
-        check_load(setup)
+        run(setup, arm=True)
     return None
 
 
