@@ -10,7 +10,7 @@ import errno
 import select
 import socket
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, NoReturn, Protocol
 
 import can
 
@@ -59,7 +59,7 @@ class Link(Protocol):
         """Close the bus."""
 
 
-def raise_link_error(error: OSError, action: str) -> None:
+def raise_link_error(error: OSError, action: str) -> NoReturn:
     """Raise what an OSError of the bus means."""
     code = error.errno or 0
     if code in _DOWN:
@@ -94,22 +94,44 @@ class SocketLink:
         except OSError as error:
             raise_link_error(error, "send")
 
-    def receive(self, timeout_ns: int) -> Frame | None:
-        """Return the next frame, or None. With no time to wait, poll tells without an exception."""
+    def carries(self, fd: bool) -> bool:
+        """True when a frame of this kind can be sent."""
+        return self._fd or not fd
+
+    def pending(self) -> bool:
+        """True when there is something to read, or an error to be seen by reading."""
         try:
-            ready = (
-                select.select(self._fds, [], [], timeout_ns * 1e-9)[0] if timeout_ns > 0 else self._poll(0)
-            )
-            if not ready:
+            return bool(self._poll(0))
+        except ValueError:  # closed
+            return True
+
+    def send_raw(self, raw: bytes) -> None:
+        """Send a frame that is laid out already; the caller answers for it."""
+        try:
+            self._write(raw)
+        except OSError as error:
+            raise_link_error(error, "send")
+
+    def receive(self, timeout_ns: int) -> Frame | None:
+        """Return the next frame, or None."""
+        raw = self.receive_raw(timeout_ns)
+        return None if raw is None else unpack_frame(raw)
+
+    def receive_raw(self, timeout_ns: int) -> bytes | None:
+        """Return what the socket has next, or None. With no time to wait, poll tells without an exception."""
+        try:
+            if timeout_ns > 0:
+                if not select.select(self._fds, [], [], timeout_ns * 1e-9)[0]:
+                    return None
+            elif not self._poll(0):
                 return None
-            raw = self._recv(128)
+            return self._recv(128)
         except BlockingIOError:
             return None
         except ValueError:  # the descriptor of a closed link
             raise_link_error(OSError(errno.EBADF, "closed"), "receive")
         except OSError as error:
             raise_link_error(error, "receive")
-        return _unpack(raw)
 
     def discard(self) -> int:
         """Throw away what is queued."""
@@ -133,7 +155,7 @@ def _discard(link: Link) -> int:
     return count
 
 
-def _unpack(raw: bytes) -> Frame | None:
+def unpack_frame(raw: bytes) -> Frame | None:
     """A frame from SocketCAN's layout; anything else on the socket is no frame."""
     if len(raw) == CLASSIC.size:
         can_id, length, data = CLASSIC.unpack(raw)

@@ -39,10 +39,10 @@ class Message:
                 f"{where}: no CAN frame has {self.length} bytes; use 0..8, 12, 16, 20, 24, 32, 48, 64"
             )
         self.signals = _signals(parsed, self.length, where)
-        self.profile, ids = _protection(parsed, where)
+        self.profile, self.data_ids = _protection(parsed, where)
         if self.profile and self.length < 3:
             raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")
-        self.valid, self._protect = make_protection(self.profile, self.length, ids)
+        self.valid, self._protect = make_protection(self.profile, self.length, self.data_ids)
         self._writers: dict[tuple[str, ...], Writer] = {}
 
     def with_signals(self, signals: Mapping[str, Signal]) -> Message:

@@ -19,7 +19,7 @@ Writer = Callable[..., bytes]
 _WORDS = {1: "B", 2: "H", 4: "I", 8: "Q"}
 
 
-def _build(name: str, lines: Sequence[str], namespace: dict[str, Any]) -> Any:
+def build(name: str, lines: Sequence[str], namespace: dict[str, Any]) -> Any:
     """Compile a function of generated lines."""
     exec("\n".join(lines), namespace)  # noqa: S102 - the source is made of numbers alone, see above
     return namespace[name]
@@ -75,30 +75,44 @@ def _float_writer(length: int) -> Callable[[float], int]:
     return lambda value: int(integer.unpack(real.pack(value))[0])
 
 
-def make_reader(length: int, signals: Sequence[Signal], whole: Sequence[bool]) -> Reader:
-    """A function from a frame's bytes to physical values; those marked ``whole`` come as int."""
+def value_lines(
+    length: int, signals: Sequence[Signal], whole: Sequence[bool], start: int = 0
+) -> tuple[list[str], list[str], dict[str, Any]]:
+    """Lines that take a frame apart, an expression for each value, and the names that both need.
+
+    The frame is called ``raw``; its data are ``length`` bytes from ``start`` on.
+    """
     words = _words(length)
     places = [_place(signal, length, words) for signal in signals]
     used = {word for word, _ in places}
     namespace: dict[str, Any] = {f"f{n}": _float_reader(n) for n in FLOAT_FORMATS}
-    lines = ["def read(data):"]
+    lines: list[str] = []
     for order, mark, name in (("l", "<", "little"), ("b", ">", "big")):
         if order in used:
-            lines.append(f"    {order} = int.from_bytes(data, {name!r})")
+            data = f"raw[{start}:{start + length}]" if start else "raw"
+            lines.append(f"{order} = int.from_bytes({data}, {name!r})")
         wanted = [f"{order}{index}" for index in range(len(words)) if f"{order}{index}" in used]
         if wanted:
-            layout = mark + "".join(
+            layout = f"{mark}{start}x" + "".join(
                 _WORDS[width] if f"{order}{index}" in used else f"{width}x"
                 for index, (_, width) in enumerate(words)
             )
-            namespace[f"unpack_{name}"] = struct.Struct(layout).unpack
-            lines.append(f"    {', '.join(wanted)}, = unpack_{name}(data)")
+            unpack = struct.Struct(layout)
+            namespace[f"unpack_{name}"] = unpack.unpack_from if start else unpack.unpack
+            lines.append(f"{', '.join(wanted)}, = unpack_{name}(raw)")
     values = [
         _phys(signal, _bits(signal, *place), want)
         for signal, place, want in zip(signals, places, whole, strict=True)
     ]
-    lines.append(f"    return ({', '.join(values)}{',' if values else ''})")
-    reader: Reader = _build("read", lines, namespace)
+    return lines, values, namespace
+
+
+def make_reader(length: int, signals: Sequence[Signal], whole: Sequence[bool]) -> Reader:
+    """A function from a frame's bytes to physical values; those marked ``whole`` come as int."""
+    lines, values, namespace = value_lines(length, signals, whole)
+    source = ["def read(raw):", *(f"    {line}" for line in lines)]
+    source.append(f"    return ({', '.join(values)}{',' if values else ''})")
+    reader: Reader = build("read", source, namespace)
     return reader
 
 
@@ -117,7 +131,7 @@ def make_writer(
     checks = " and ".join(_check(index, signal) for index, signal in enumerate(signals)) or "True"
     lines += [f"    if not ({checks}):", f"        return refuse({arguments})"]
     lines.append(f"    return protect({_frame(length, signals)})")
-    writer: Writer = _build("write", lines, namespace)
+    writer: Writer = build("write", lines, namespace)
     return writer
 
 
@@ -150,14 +164,30 @@ def _frame(length: int, signals: Sequence[Signal]) -> str:
     return f"({little} | {swapped}).to_bytes({length}, 'little')"
 
 
+def _crc8(length: int, start: int = 0) -> str:
+    """Expression of profile 2's CRC of a frame called ``raw``, unrolled."""
+    crc = "255"
+    for index in range(start + 1, start + length):
+        crc = f"T[{crc} ^ raw[{index}]]"
+    return f"T[{crc} ^ I[raw[{start + 1}] & 15]] ^ 255"
+
+
+def crc_lines(profile: int, length: int, ids: bytes, start: int) -> tuple[str, dict[str, Any]]:
+    """Expression that is true for a frame ``raw`` with the right CRC, "" for no CRC, and its names."""
+    if profile == 2:
+        return f"raw[{start}] == {_crc8(length, start)}", {"T": CRC8_TABLE, "I": ids}
+    if profile == 0:
+        return "", {}
+    inner = f"crc_hqx(raw[{start + 2}:{start + length}], 65535)"
+    check = f"raw[{start}] | raw[{start + 1}] << 8 == crc_hqx(tail, {inner})"
+    return check, {"crc_hqx": crc_hqx, "tail": bytes(reversed(ids))}
+
+
 def make_crc(profile: int, length: int, ids: bytes) -> Callable[[bytes], int]:
     """The CRC of a whole frame of ``length`` bytes, unrolled for profile 2."""
     if profile == 2:
-        crc = "255"
-        for index in range(1, length):
-            crc = f"T[{crc} ^ d[{index}]]"
-        source = f"def crc(d): return T[{crc} ^ I[d[1] & 15]] ^ 255"
-        function: Callable[[bytes], int] = _build("crc", [source], {"T": CRC8_TABLE, "I": ids})
+        source = f"def crc(raw): return {_crc8(length)}"
+        function: Callable[[bytes], int] = build("crc", [source], {"T": CRC8_TABLE, "I": ids})
         return function
     tail = bytes(reversed(ids))  # profile 5: the 16-bit id, low byte last in the attribute's order
     return lambda data: crc_hqx(tail, crc_hqx(data[2:], 0xFFFF))

@@ -48,7 +48,7 @@ class Incoming:
         self._counted = bool(counter)
         self._read = message.reader(*counter, *names, whole={*counter, *whole})
         self._modulus = bound.counter_modulus
-        self._last = -1
+        self.last = -1
         self.cells: list[Cell] = []
 
     def take(self, data: bytes, late: bool = False) -> int:
@@ -70,7 +70,7 @@ class Incoming:
 
     def _judge(self, counter: int) -> int:
         """Flags of a frame's counter against the last one's."""
-        last, self._last = self._last, counter
+        last, self.last = self.last, counter
         if counter == last:
             return COUNTER_REPEATED
         return FRESH if last < 0 or counter == (last + 1) % self._modulus else FRESH | COUNTER_JUMP

@@ -13,9 +13,7 @@ class RealClock:
 
     name = "monotonic"
 
-    def now_ns(self) -> int:
-        """Return monotonic nanoseconds."""
-        return time.monotonic_ns()
+    now_ns = staticmethod(time.monotonic_ns)  # no frame of Python's between a stamp and the clock
 
     def sleep_until(self, deadline_ns: int) -> int:
         """Sleep to the absolute deadline; return the time of waking, at once when it has passed."""

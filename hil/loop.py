@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from hil.ports import Clock, Drive, Recorder
-from hil.signals import DriveState, Reason, Request, RxFlag, TickArray
+from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, cell
 
 Pacing = Literal["sync", "feedback", "timer"]
 Step = Callable[[TickArray], None]
@@ -20,6 +20,7 @@ NO_WAIT = 1
 """A deadline that has long passed: one feedback if it is there already."""
 QUEUE_MOST = 4096
 """Queued feedback that one tick takes; a flood can't hold it longer."""
+ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 
 
 class StopRequest:
@@ -62,6 +63,19 @@ def transition_event(state: int, reason: int) -> tuple[str, str]:
     return ("stop", f"{name}: {Reason(reason).name}") if reason else ("state", name)
 
 
+class Cells:
+    """The fields of the tick that the loop itself writes and reads."""
+
+    __slots__ = (
+        "computed_ns", "gap", "k", "lateness_ns", "log_failed", "reason", "received_ns", "recorded_ns",
+        "request", "rx_flags", "send", "sent_ns", "skipped", "state", "t_ns",
+    )  # fmt: skip
+
+    def __init__(self, ticks: TickArray) -> None:
+        for name in self.__slots__:
+            setattr(self, name, cell(ticks, name))
+
+
 class Loop:
     """A closed loop over a drive port. :meth:`run` returns after a safe stop, whatever happened."""
 
@@ -79,6 +93,7 @@ class Loop:
         self._drive, self._clock, self._recorder = drive, clock, recorder
         self._prepare, self._step = prepare, step
         self._ticks, self._plan, self._request = ticks, plan, request
+        self._cells: Any = Cells(ticks)
         self._outcome = Outcome()
         self._arrived_ns = 0
         self._state = int(DriveState.SWITCH_ON_DISABLED)
@@ -102,7 +117,7 @@ class Loop:
             k, gap = self._skip(k, deadline_ns, now_ns)
             k = self._one(tick, k, start_ns + k * plan.period_ns, gap, now_ns)
             outcome.ticks += 1
-            if self._ended(tick, k):
+            if self._ended():
                 return
             k += 1
 
@@ -118,25 +133,25 @@ class Loop:
 
     def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> int:
         """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on."""
-        clock = self._clock
-        self._stamp(tick, k, deadline_ns, gap, now_ns)
-        tick["rx_flags"] = 0
+        now, t = self._clock.now_ns, self._cells
+        self._stamp(k, deadline_ns, gap, now_ns)
+        t.rx_flags[0] = 0
         if self._plan.pacing == "feedback":
             k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
         else:
             self._exchange(tick, deadline_ns)
-        tick["received_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
+        t.received_ns[0] = min(now() - deadline_ns, MAX_NS)
         self._prepare(self._ticks)
         self._step(self._ticks)
-        tick["computed_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
-        if tick["send"]:
+        t.computed_ns[0] = min(now() - deadline_ns, MAX_NS)
+        if t.send[0]:
             self._send(tick)
-        tick["sent_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
-        if tick["state"] != self._state:
-            self._state = int(tick["state"])
-            self._recorder.event(deadline_ns, k, *transition_event(self._state, int(tick["reason"])))
+        t.sent_ns[0] = min(now() - deadline_ns, MAX_NS)
+        if t.state[0] != self._state:
+            self._state = t.state[0]
+            self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))
         self._recorder.tick(self._ticks)
-        tick["recorded_ns"] = min(clock.now_ns() - deadline_ns, MAX_NS)
+        t.recorded_ns[0] = min(now() - deadline_ns, MAX_NS)
         return k
 
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
@@ -145,34 +160,36 @@ class Loop:
         Each feedback is one period of the drive's clock; lateness is then how much later it came than one
         period after the last. Returns k and its deadline.
         """
+        flags = self._cells.rx_flags
         plan, drive, fresh = self._plan, self._drive, int(RxFlag.FRESH)
         wait_ns = plan.period_ns * 3 // 2
         drive.receive(tick, self._clock.receive_deadline(self._clock.now_ns(), wait_ns))
         heard = 0
-        while int(tick["rx_flags"]) & fresh and heard < QUEUE_MOST:
+        while flags[0] & fresh and heard < QUEUE_MOST:
             heard += 1
-            tick["rx_flags"] = int(tick["rx_flags"]) & ~fresh
+            flags[0] = flags[0] & ~fresh
             drive.receive(tick, NO_WAIT)
         skipped = max(heard - 1, 0) if k else 0
         if heard:
-            tick["rx_flags"] = int(tick["rx_flags"]) | fresh
+            flags[0] = flags[0] | fresh
         if skipped:
             k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
             self._outcome.skipped += skipped
         now_ns = self._clock.now_ns()
         expected_ns = self._arrived_ns + (1 + skipped) * plan.period_ns if k else now_ns
-        self._stamp(tick, k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
+        self._stamp(k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
         self._arrived_ns = now_ns
         return k, deadline_ns
 
-    def _stamp(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
-        tick["k"] = k
-        tick["t_ns"] = deadline_ns
-        tick["gap"] = gap
-        tick["skipped"] = gap - 1
-        tick["lateness_ns"] = max(min(now_ns - deadline_ns, MAX_NS), -MAX_NS)
-        tick["request"] = self._requested(k)
-        tick["log_failed"] = self._recorder.failed
+    def _stamp(self, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
+        t = self._cells
+        t.k[0] = k
+        t.t_ns[0] = deadline_ns
+        t.gap[0] = gap
+        t.skipped[0] = gap - 1
+        t.lateness_ns[0] = max(min(now_ns - deadline_ns, MAX_NS), -MAX_NS)
+        t.request[0] = self._requested(k)
+        t.log_failed[0] = self._recorder.failed
 
     def _requested(self, k: int) -> int:
         """The operator's request; at the end of the planned length, a stop."""
@@ -190,7 +207,7 @@ class Loop:
             try:
                 drive.sync(tick)
             except OSError:
-                tick["rx_flags"] |= int(RxFlag.BUS_DOWN)
+                self._cells.rx_flags[0] |= int(RxFlag.BUS_DOWN)
                 return
             drive.receive(tick, self._clock.receive_deadline(deadline_ns, plan.timeout_ns))
 
@@ -199,11 +216,12 @@ class Loop:
         try:
             self._drive.send(tick)
         except OSError as error:
-            tick["send"] = 0
-            self._recorder.event(int(tick["t_ns"]), int(tick["k"]), "send-failed", str(error))
+            t = self._cells
+            t.send[0] = 0
+            self._recorder.event(t.t_ns[0], t.k[0], "send-failed", str(error))
 
-    def _ended(self, tick: Any, k: int) -> bool:
+    def _ended(self) -> bool:
         """True once the supervisor has left every state in which it drives the drive."""
-        self._outcome.state, self._outcome.reason = int(tick["state"]), int(tick["reason"])
-        done = tick["state"] in (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
-        return bool(done and tick["reason"] != Reason.NONE)
+        outcome, t = self._outcome, self._cells
+        outcome.state, outcome.reason = state, reason = t.state[0], t.reason[0]
+        return reason != 0 and state in ENDED

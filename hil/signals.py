@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -225,6 +225,20 @@ def new_ticks(count: int = 1) -> TickArray:
     for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
         ticks[name] = np.nan
     return ticks
+
+
+Cell = Any
+"""One integer field of one record, at index 0: a memoryview, which Python 3.11 has no generic type for."""
+
+
+def cell(ticks: TickArray, name: str) -> Cell:
+    """An integer field of the first record: 0.03 us to set, where the record's own field takes 0.5 us."""
+    kind: Any
+    kind, offset = TICK.fields[name][:2]  # type: ignore[index]
+    code: Any = {"u8": "Q", "i8": "q", "u4": "I", "i4": "i"}[kind.str[1:]]
+    of_bytes: Any = ticks.view("u1").data
+    field: Cell = of_bytes[offset : offset + kind.itemsize].cast(code)
+    return field
 
 
 def ticks_from(raw: bytes) -> TickArray:

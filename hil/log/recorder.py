@@ -17,7 +17,7 @@ from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
 from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
-from hil.signals import TICK, TickArray
+from hil.signals import TICK, TickArray, new_ticks
 
 __all__ = ["BYTES_PER_TICK", "LogError", "Recorder", "check_folder", "open_recorder"]
 
@@ -79,6 +79,8 @@ class Recorder:
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
+        self._pack_frame = self._frames.packer(FRAME_RECORD)
+        self._record, self._record_bytes = new_ticks(), memoryview(b"")
         self._failed = self._closed = False
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
         self._writer = self._spawn()
@@ -140,11 +142,13 @@ class Recorder:
 
     def tick(self, tick: TickArray) -> None:
         """Store one tick."""
-        self._ticks.push(tick.tobytes())
+        if tick is not self._record:
+            self._record, self._record_bytes = tick, tick.view("u1").data
+        self._ticks.push(self._record_bytes)
 
     def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one raw CAN frame."""
-        self._frames.push(FRAME_RECORD.pack(t_ns, can_id, received, len(data), data))
+        self._pack_frame(t_ns, can_id, received, len(data), data)
 
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Store one event; the text is cut to what a record holds."""
