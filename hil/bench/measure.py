@@ -60,7 +60,7 @@ def bench(path: Path, overrides: Overrides, length: Length, say: Say) -> Bench:
     say("bench: simulation")
     ours = Histogram.of(run.ticks["lateness_ns"].astype(np.int64))
     result = _result(run, floor, ours, anchor) | rates
-    result |= {"replay_x_realtime": replay_x, "simulate_x_realtime": _simulate_speed(path, overrides, length)}
+    result |= {"replay_x_realtime": replay_x, "simulate_x_realtime": simulate_speed(path, overrides, length)}
     return Bench(result | {"machine": machine_facts()}, ours, anchor.lateness)
 
 
@@ -146,7 +146,7 @@ def _replay_speed(run: LoopRun) -> float:
     return float(span_s / ((clock.now_ns() - begin_ns) * 1e-9))
 
 
-def _simulate_speed(path: Path, overrides: Overrides, length: Length) -> float:
+def simulate_speed(path: Path, overrides: Overrides, length: Length) -> float:
     """Simulated seconds per second, log included, kernels warm."""
     import tempfile
 

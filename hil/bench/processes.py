@@ -25,8 +25,9 @@ from hil.signals import RxFlag, TickArray
 
 SLACK_S: Final = 60.0
 SETTLED_S: Final = 0.5
-CALM_PLANT: Final = ("load=[]", "firmware={watchdog_ms=400.0}")
-"""No load that moves the motor while nobody drives it: the same drive answers all loops of a bench."""
+CALM_PLANT: Final = ("load=[]", "truth=false", "firmware={watchdog_ms=400.0}")
+"""The same drive answers all loops of a bench: no load that moves the motor while nobody drives it, and
+FEEDBACK alone, as from a real drive, without the true values that only an emulator can tell."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""What people would use instead, measured beside this project in one run: ``python -m benchmarks``."""
