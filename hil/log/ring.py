@@ -13,8 +13,6 @@ import contextlib
 import fcntl
 import mmap
 import os
-import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -75,23 +73,10 @@ class Ring:
         header[HEAD_AT] = head + 1
         return True
 
-    def packer(self, layout: struct.Struct) -> Callable[..., bool]:
-        """Return what packs values by ``layout`` into the next record; it returns False for a drop."""
-        if layout.size != self.record_size:
-            raise RingError(f"a record has {self.record_size} bytes, not {layout.size}")
-        header, memory, pack_into = self.header, self._bytes, layout.pack_into
-        size, capacity = self.record_size, self.capacity
-
-        def push(*values: object) -> bool:
-            head = header[HEAD_AT]
-            if head - header[TAIL_AT] >= capacity:
-                header[DROPPED_AT] += 1
-                return False
-            pack_into(memory, HEADER_BYTES + head % capacity * size, *values)
-            header[HEAD_AT] = head + 1
-            return True
-
-        return push
+    @property
+    def memory(self) -> memoryview:
+        """All of the ring; a producer that packs in place writes the record, then the head."""
+        return self._bytes
 
     def take(self, *, final: bool = False) -> bytes:
         """Return the records published before the previous look, whole; with ``final`` all there are."""
