@@ -353,6 +353,11 @@ class DriveClient:
         if not self._quiet:
             self._on_frame(False, self._now(), can_id, data)
 
+    def stop_from(self, counter: int) -> None:
+        """:meth:`stop` with counters after ``counter``: for another process than the one that sent."""
+        self._last_sent = counter
+        self.stop()
+
     def stop(self) -> None:
         """Zero voltage and disable, a few times with advancing counters and SYNC; never raises."""
         counter = self._last_sent

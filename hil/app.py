@@ -20,7 +20,7 @@ from typing import Any
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
-from drivers.client import DriveClient, ignore_frame
+from drivers.client import DriveClient, OnFrame, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
@@ -31,6 +31,7 @@ from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
+from hil.guardian import GuardedDrive, Words, guardian
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.loop import Loop, Outcome, Plan, StopRequest
 from hil.ports import Drive
@@ -261,20 +262,24 @@ def opened_client(
 ) -> Iterator[DriveClient]:
     """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
     on_frame = recorder.frame if recorder and setup.config.log.frames else ignore_frame
-    link = open_link(bus_settings(setup.config))
-    client = DriveClient(
-        link,
-        setup.database,
-        load=setup.config.controller.kind == "fac",
-        drive_map=setup.binding.map,
-        on_frame=watch.chained(on_frame) if watch else on_frame,
-        now=clock.now_ns,
-    )
-    client.warm_up(new_ticks()[0])
+    client = _client(setup, watch.chained(on_frame) if watch else on_frame, clock.now_ns)
     try:
         yield client
     finally:
         client.close()
+
+
+def _client(
+    setup: Setup, on_frame: OnFrame = ignore_frame, now: Callable[[], int] = time.monotonic_ns
+) -> DriveClient:
+    """A drive client on a link of its own, warmed up."""
+    load = setup.config.controller.kind == "fac"
+    link = open_link(bus_settings(setup.config))
+    client = DriveClient(
+        link, setup.database, load=load, drive_map=setup.binding.map, on_frame=on_frame, now=now
+    )
+    client.warm_up(new_ticks()[0])
+    return client
 
 
 def check_arming(setup: Setup, arm: bool) -> None:
@@ -324,6 +329,32 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
+    with _guarding(setup) as words:
+        return _recorded(setup, request, path, clock, words)
+
+
+@contextlib.contextmanager
+def _guarding(setup: Setup) -> Iterator[Words | None]:
+    """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own."""
+    config = setup.config
+    loop, alone = config.loop, config.bus.interface == "virtual"
+    if alone or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
+        yield None
+    else:
+        timeout_ns = config.guardian.timeout_ns(loop)
+        with guardian(timeout_ns, config.realtime.fifo_priority, lambda: _client(setup)) as words:
+            yield words
+
+
+def _recorded(
+    setup: Setup,
+    request: StopRequest,
+    path: Path,
+    clock: RealClock | LockstepClock,
+    words: Words | None,
+) -> RunResult:
+    """Open recorder and drive, arm, run."""
+    config = setup.config
     recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
     try:
         watch = CommandWatch(setup.binding) if config.loop.shadow else None
@@ -332,7 +363,9 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
             _await_drive(setup, client)
             say(f"{'listening only' if watch else 'arming'}; log {path}")
             client.discard()
-            drive = ShadowDrive(client, watch.applied) if watch else client
+            drive: Drive = ShadowDrive(client, watch.applied) if watch else client
+            if words:
+                drive = GuardedDrive(client, words, clock.now_ns)
             if watch:
                 recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
             result = _run_armed(setup, drive, recorder, clock, request)

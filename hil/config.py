@@ -120,6 +120,19 @@ class RealtimeTable(Table):
     lock_memory: bool = True
 
 
+class GuardianTable(Table):
+    """The process that stops the drive when the loop falls silent for longer than any tolerated skip."""
+
+    enabled: bool = True
+    timeout_ms: Positive | None = None
+
+    def timeout_ns(self, loop: LoopTable) -> int:
+        """Default: five periods more than the gap at which the supervisor stops, at least 10 ms."""
+        if self.timeout_ms is not None:
+            return round(self.timeout_ms * 1e6)
+        return max((loop.max_gap_ticks + 5) * loop.period_ns, 10_000_000)
+
+
 class BusTable(Table):
     """The CAN bus, in python-can's terms."""
 
@@ -316,6 +329,7 @@ class RunConfig(Table):
 
     loop: LoopTable = LoopTable()
     realtime: RealtimeTable = RealtimeTable()
+    guardian: GuardianTable = GuardianTable()
     bus: BusTable = BusTable()
     drive: DriveTable
     motor: Annotated[MotorTable, BeforeValidator(included)]

@@ -71,6 +71,8 @@ class RxFlag(IntEnum):
     BUS_DOWN = 1 << 8
     FOREIGN_COMMAND = 1 << 9
     SEND_FAILED = 1 << 10
+    GUARDIAN = 1 << 11
+    GUARDIAN_LOST = 1 << 12
 
 
 class Reason(IntEnum):
@@ -100,6 +102,8 @@ class Reason(IntEnum):
     CONTROLLER_ERROR = 21
     I2T = 22
     ENERGY = 23
+    GUARDIAN = 24
+    GUARDIAN_LOST = 25
 
 
 class GuardFlag(IntEnum):

@@ -30,10 +30,14 @@ def judge_bus(p: Any, s: Any, t: Any) -> int:
     s["counter_level"] = leaky(
         s["counter_level"], (flags & (RxFlag.COUNTER_REPEATED | RxFlag.COUNTER_JUMP)) != 0
     )
+    if flags & RxFlag.GUARDIAN:
+        return Reason.GUARDIAN.value
     if flags & RxFlag.BUS_DOWN:
         return Reason.BUS_DOWN.value
     if flags & RxFlag.SEND_FAILED:
         return Reason.SEND_FAILED.value
+    if flags & RxFlag.GUARDIAN_LOST:
+        return Reason.GUARDIAN_LOST.value
     if flags & RxFlag.FOREIGN_COMMAND:
         return Reason.FOREIGN_COMMAND.value
     if s["crc_level"] > 4 * p["error_budget"]:
@@ -199,8 +203,9 @@ def supervise(p: Any, s: Any, t: Any) -> None:
 
     SWITCH_ON_DISABLED (disarmed) --ARM--> READY_TO_SWITCH_ON -> SWITCHED_ON -> OPERATION_ENABLED
     -> QUICK_STOP_ACTIVE -> SWITCH_ON_DISABLED, or -> FAULT_REACTION_ACTIVE -> FAULT. Disarmed and after a
-    stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down, and in a shadow run,
-    nothing is sent. A stop that is asked for before arming ends the run there.
+    stop, ``send`` is 0 but for the one frame that disables the drive; with the bus down, once the guardian
+    has stopped the drive, and in a shadow run, nothing is sent. A stop that is asked for before arming ends
+    the run there.
     """
     state = s["state"]
     controlword = Controlword.DISABLE_VOLTAGE.value
@@ -222,4 +227,5 @@ def supervise(p: Any, s: Any, t: Any) -> None:
     t["reason"] = s["reason"]
     t["controlword"] = controlword
     down = (t["rx_flags"] & RxFlag.BUS_DOWN) != 0 or s["reason"] == Reason.BUS_DOWN
+    down = down or (t["rx_flags"] & RxFlag.GUARDIAN) != 0 or s["reason"] == Reason.GUARDIAN
     t["send"] = 0 if down or p["shadow"] else send

@@ -128,7 +128,7 @@ def test_signals_stop_safely(
 def test_a_killed_run_leaves_a_readable_log_and_a_drive_at_rest(
     configs: Path, settings: Settings, tmp_path: Path, channel: str
 ) -> None:
-    own = settings("loop.duration_s=60.0")
+    own = settings("loop.duration_s=60.0", "guardian.enabled=false")  # the drive's own watchdog alone
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
         log_file = wait_for_log(tmp_path)

@@ -145,6 +145,8 @@ STOPS: list[tuple[str, Reason, int, dict[str, float], int]] = [
     ("bus down", Reason.BUS_DOWN, int(RxFlag.BUS_DOWN), {}, 0),
     ("send failed", Reason.SEND_FAILED, FRESH | int(RxFlag.SEND_FAILED), {}, 0),
     ("foreign command", Reason.FOREIGN_COMMAND, FRESH | int(RxFlag.FOREIGN_COMMAND), {}, 0),
+    ("guardian", Reason.GUARDIAN, FRESH | int(RxFlag.GUARDIAN), {}, 0),
+    ("guardian lost", Reason.GUARDIAN_LOST, FRESH | int(RxFlag.GUARDIAN_LOST), {}, 0),
     ("log failed", Reason.LOG_FAILED, FRESH, {"log_failed": 1}, 0),
 ]
 
@@ -206,9 +208,10 @@ def test_stale_feedback_holds_then_quick_stops_then_faults(bench: Bench) -> None
     assert rows[-1][0] == DriveState.FAULT and bench.t["reason"] == Reason.STALE_FEEDBACK
 
 
-def test_bus_down_sends_nothing_more(bench: Bench) -> None:
+@pytest.mark.parametrize("flag", [RxFlag.BUS_DOWN, RxFlag.GUARDIAN])
+def test_with_the_bus_down_or_the_guardian_acting_nothing_more_is_sent(bench: Bench, flag: RxFlag) -> None:
     bench.enable()
-    assert bench.step(int(RxFlag.BUS_DOWN))["send"] == 0
+    assert bench.step(int(flag))["send"] == 0
     assert all(row[3] == 0 for row in bench.until_over())
 
 

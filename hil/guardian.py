@@ -1,0 +1,183 @@
+"""The guardian: a process beside the loop that sends the stop frames when the loop no longer can.
+
+It watches the controller's death (pidfd: SIGKILL, a crash) and its heartbeat (SIGSTOP, a deadlock), each
+tick's time in a word of shared memory that costs the loop one store. When either fails while the drive is
+armed it latches ``FIRED`` and sends zero voltage and disable, repeated, through a link of its own. A
+controller that wakes up again finds the latch before its next frame and never sends again; should one frame
+have been between its last look and the socket, the guardian sees the sign of life and sends the stop frames
+once more.
+
+Not seen by it: a controller that ticks on but computes nonsense (the guard's part), and a host that is
+dead as a whole (the drive's own watchdog's part).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import select
+import signal
+from collections.abc import Callable, Iterator
+from enum import IntEnum
+from typing import Any, Protocol
+
+from hil.clock import RealClock
+from hil.errors import HilError
+from hil.ports import Drive
+from hil.signals import DriveState, RxFlag
+
+GUARDIAN_LOST_NS = 500_000_000
+"""Age of the guardian's own heartbeat at which the controller stops the run."""
+START_S = 5.0
+STOPS = 3
+"""How often the drive client's sequence of stop frames is sent when the guardian fires."""
+
+
+class Word(IntEnum):
+    """Places of the shared words (int64 each)."""
+
+    ARMED = 0
+    BEAT_NS = 1
+    COUNTER = 2
+    FIRED = 3
+    GUARD_NS = 4
+    READY = 5
+
+
+class Stopper(Protocol):
+    """What can send the stop frames."""
+
+    def stop_from(self, counter: int) -> None:
+        """Send zero voltage and disable, with counters after ``counter``; never raises."""
+
+
+class Words:
+    """Shared words of controller and guardian; a store or load of one is atomic on every 64-bit machine."""
+
+    def __init__(self) -> None:
+        self.cells: Any = memoryview(mmap.mmap(-1, mmap.PAGESIZE)).cast("q")
+
+
+class GuardedDrive:
+    """A drive port that tells the guardian of each tick; nothing is sent once the guardian has fired."""
+
+    def __init__(self, drive: Drive, words: Words, now: Callable[[], int]) -> None:
+        self._drive, self._cells, self._now = drive, words.cells, now
+        self._fired, self._beat, self._counter = int(Word.FIRED), int(Word.BEAT_NS), int(Word.COUNTER)
+
+    def sync(self, tick: Any) -> None:
+        """SYNC, unless the guardian has stopped the drive."""
+        self._cells[self._beat] = self._now()
+        if not self._cells[self._fired]:
+            self._drive.sync(tick)
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        """Feedback, and what the guardian did."""
+        self._drive.receive(tick, deadline_ns)
+        cells = self._cells
+        if cells[self._fired]:
+            tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.GUARDIAN)
+        elif self._now() - cells[Word.GUARD_NS] > GUARDIAN_LOST_NS:
+            tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.GUARDIAN_LOST)
+
+    def send(self, tick: Any) -> None:
+        """The command, unless the guardian has stopped the drive."""
+        cells = self._cells
+        cells[self._beat] = self._now()
+        cells[Word.ARMED] = int(tick["state"] != DriveState.SWITCH_ON_DISABLED)
+        cells[self._counter] = int(tick["counter"])
+        if cells[self._fired]:
+            tick["send"] = 0
+            return
+        self._drive.send(tick)
+
+    def stop(self) -> None:
+        """The controller's own stop frames; the guardian watches until they are out."""
+        if not self._cells[self._fired]:
+            self._drive.stop()
+        self._cells[Word.ARMED] = 0
+
+    def close(self) -> None:
+        """Release the bus."""
+        self._drive.close()
+
+
+def watch(words: Words, parent_fd: int, timeout_ns: int, stopper: Stopper) -> None:
+    """Watch until the controller has gone; fire when it dies or is silent for ``timeout_ns`` while armed."""
+    cells, now, poll = words.cells, RealClock().now_ns, select.poll()
+    poll.register(parent_fd, select.POLLIN)
+    answered = 0
+    while True:
+        beat = cells[Word.BEAT_NS]
+        if cells[Word.FIRED] and beat != answered:  # a sign of life after the latch: once more
+            answered = beat
+            stopper.stop_from(cells[Word.COUNTER])
+        cells[Word.GUARD_NS] = now()
+        left_ns = beat + timeout_ns - now() if cells[Word.ARMED] and not cells[Word.FIRED] else timeout_ns
+        gone = bool(poll.poll(max(left_ns, 0) // 1_000_000 + (left_ns > 0)))
+        silent = now() - cells[Word.BEAT_NS] > timeout_ns
+        if cells[Word.ARMED] and not cells[Word.FIRED] and (gone or silent):
+            cells[Word.FIRED] = 1
+            answered = cells[Word.BEAT_NS]
+            for _ in range(STOPS):
+                stopper.stop_from(cells[Word.COUNTER])
+        if gone:
+            return
+
+
+def _serve(
+    words: Words, timeout_ns: int, priority: int, open_stopper: Callable[[], Stopper], report: int
+) -> None:
+    """The guardian's whole life, in the forked child; never returns to the caller's code."""
+    try:
+        os.setsid()
+        for number in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        parent_fd = os.pidfd_open(os.getppid())
+        stopper = open_stopper()
+        if priority > 0:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(priority + 1, 99)))
+        words.cells[Word.GUARD_NS] = RealClock().now_ns()
+        os.write(report, b"ready")
+        os.close(report)
+        watch(words, parent_fd, timeout_ns, stopper)
+        os._exit(0)
+    except BaseException as error:  # noqa: BLE001 - a forked child must not run the parent's handlers
+        with contextlib.suppress(OSError):
+            os.write(report, f"{type(error).__name__}: {error}".encode()[:500])
+        os._exit(1)
+
+
+@contextlib.contextmanager
+def guardian(timeout_ns: int, priority: int, open_stopper: Callable[[], Stopper]) -> Iterator[Words]:
+    """A guardian while the block runs. Fork it before the recorder: it must not hold the recorder's pipes.
+
+    ``open_stopper`` runs in the guardian and opens a link of its own. Raises HilError when it can't start.
+    """
+    words = Words()
+    ours, theirs = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        os.close(ours)
+        _serve(words, timeout_ns, priority, open_stopper, theirs)
+    os.close(theirs)
+    try:
+        _await_ready(ours)
+        yield words
+    finally:
+        os.close(ours)
+        if words.cells[Word.ARMED] == 0:  # else the controller is failing: the guardian outlives it
+            os.kill(pid, signal.SIGKILL)
+            os.waitpid(pid, 0)
+
+
+def _await_ready(ours: int) -> None:
+    """Wait until the guardian says that it watches. Raises HilError with what it says instead."""
+    poll = select.poll()
+    poll.register(ours, select.POLLIN)
+    said = os.read(ours, 1000).decode(errors="replace") if poll.poll(START_S * 1000) else "no answer"
+    if said != "ready":
+        raise HilError(f"the guardian can't start: {said}; nothing was sent")
