@@ -50,7 +50,7 @@ class Bench:
 
     def until_moving(self) -> None:
         """Wait until the controller commands a voltage."""
-        for _ in range(60):
+        for _ in range(180):  # kernels may have to be compiled first
             if any(abs(values["VoltageQ"]) > 20.0 for _, values in self.frames(COMMAND, 0.5)):
                 return
         raise AssertionError("the run does not begin")
