@@ -1,0 +1,76 @@
+"""The loop, ring and client over thousands of ticks: nothing grows, nothing is left for the collector."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.bus import BusSettings, open_link
+from drivers.client import DriveClient
+from hil.app import Overrides, header_of, load_setup
+from hil.clock import LockstepClock
+from hil.log.recorder import Recorder
+from hil.loop import Loop, Plan, StopRequest
+from hil.signals import TickArray, new_ticks
+from tests.conftest import CONFIGS
+
+pytestmark = [pytest.mark.process, pytest.mark.compiled]
+TICKS, SETTLED = 1900, 300  # the drive never enables: the run ends itself after 2000
+
+
+class Answered:
+    """The drive client, with the other end of the bus answering each SYNC."""
+
+    def __init__(self, client: DriveClient, peer: Any, answers: list[bytes]) -> None:
+        self._client, self._peer, self._answers, self._k = client, peer, answers, 0
+        self.receive, self.send, self.stop, self.close = (
+            client.receive, client.send, client.stop, client.close,
+        )  # fmt: skip
+
+    def sync(self, tick: Any) -> None:
+        self._client.sync(tick)
+        self._k += 1
+        self._peer.send(0x181, self._answers[self._k % 16])
+        self._peer.discard()
+
+
+def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
+    setup = load_setup(CONFIGS / "demo.toml", Overrides())
+    machine, ticks = setup.machine.fresh(), new_ticks()
+    setup.machine.warm_up()
+    recorder = Recorder(tmp_path / "run.mcap", header_of(setup, "run", "lockstep"), 2000)
+    settings = BusSettings("hil-local", channel)
+    peer, link = open_link(settings), open_link(settings)
+    client = DriveClient(link, setup.database, on_frame=recorder.frame)
+    feedback = setup.database.message("FEEDBACK")
+    answers = [feedback.encode({"Counter": k, "State": 1}) for k in range(16)]
+    seen: list[tuple[int, int]] = []
+    count = 0
+
+    def step(array: TickArray) -> None:
+        nonlocal count
+        machine.step(array)
+        count += 1
+        if count in (SETTLED, TICKS - 10):
+            seen.append((gc.get_count()[0], sys.getallocatedblocks()))
+
+    plan = Plan(1_000_000, 800_000, "sync", TICKS)
+    drive = Answered(client, peer, answers)
+    loop = Loop(drive, LockstepClock(), recorder, machine.prepare, step, ticks, plan, StopRequest())
+    gc.collect()
+    gc.disable()
+    try:
+        loop.run()
+    finally:
+        gc.enable()
+        recorder.close({})
+        client.close()
+        peer.close()
+    assert len(seen) == 2, "the loop ended early"
+    (objects, blocks), (objects_then, blocks_then) = seen
+    assert objects_then - objects <= 20, "a tick leaves objects for the collector"
+    assert blocks_then - blocks <= 200, "memory grows with the ticks"
