@@ -25,7 +25,7 @@ LIMIT_S = 120
 
 
 def peer(*command: str) -> dict[str, Any]:
-    """One peer's JSON, or ``skipped`` and why."""
+    """One peer's JSON, or what is ``missing``."""
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=HERE.parent
     )

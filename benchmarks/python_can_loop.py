@@ -1,8 +1,8 @@
 """Peer: the loop as it is usually written with python-can and cantools, on the same bus and drive.
 
 recv and send of can.Message, decode and encode by cantools, a PI speed and current law in plain Python, and
-time.sleep for what is left of the period, so that lateness adds up. It checks no CRC and no counter, limits
-nothing, logs nothing. Prints one JSON line. ``python -m benchmarks.python_can_loop INTERFACE CHANNEL DBC``
+time.sleep for what is left of the period, so that lateness adds up. It checks no CRC and no counter, and
+logs nothing. Prints one JSON line. ``python -m benchmarks.python_can_loop INTERFACE CHANNEL DBC``
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ class Law:
         asked = 0.3 * -w + 2.0 * self.speed
         self.current_q += self.period_s * (asked - i_q)
         self.current_d += self.period_s * -i_d
-        return 8.0 * (asked - i_q) + 500.0 * self.current_q, 8.0 * -i_d + 500.0 * self.current_d
+        u_q = 8.0 * (asked - i_q) + 500.0 * self.current_q
+        u_d = 8.0 * -i_d + 500.0 * self.current_d
+        return max(-300.0, min(300.0, u_q)), max(-300.0, min(300.0, u_d))
 
 
 def run(bus: can.BusABC, database: Any, period_s: float, ticks: int) -> Counted:
