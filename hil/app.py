@@ -38,6 +38,7 @@ from hil.ports import Drive
 from hil.progress import say, watching
 from hil.shadow import ShadowDrive
 from hil.signals import Reason, new_ticks
+from hil.watch.registry import announced, own_entry, who_asked
 
 MAX_LOAD = 0.7
 LOAD_REMEDY = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
@@ -413,7 +414,9 @@ def _run_armed(
         with stopping_on_signals(request):
             if clock.name == "monotonic":
                 grants = realtime.acquire(setup.config.realtime)
-            with watching(os.getpid(), plan.ticks):
+            bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
+            entry = own_entry(recorder.path, f"{bus.interface}:{bus.channel}", rate_hz, plan.ticks)
+            with announced(entry), watching(os.getpid(), plan.ticks):
                 begin_ns = time.thread_time_ns()
                 outcome = loop.run()
                 processor_ns = time.thread_time_ns() - begin_ns
@@ -422,6 +425,9 @@ def _run_armed(
         raise
     finally:
         realtime.release()
+        if asked := who_asked(os.getpid()):
+            t_ns, k, who = asked
+            recorder.event(t_ns, k, "stop-asked", who)
         dropped = recorder.dropped
         ended = failure or Reason(outcome.reason).name.lower()
         result = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hil.commands import bench, demo, emulated, log, paper, replay, report, run
+from hil.commands import bench, demo, emulated, log, paper, replay, report, run, watch
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -14,6 +14,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil demo                     one minute: emulated drive, closed loop, load step, replay
   hil emulate CONFIG           the emulated drive as a process of its own
   hil run CONFIG               the controller, on the bus that CONFIG names
+  hil watch [PID|CHANNEL|LOG]  a running run live: terminal, --web, --foxglove; stops it, too
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
   hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
@@ -22,7 +23,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, emulated, replay, report, log, paper, bench)
+MODULES = (demo, run, watch, emulated, replay, report, log, paper, bench)
 
 
 def _parser() -> argparse.ArgumentParser:

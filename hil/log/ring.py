@@ -92,12 +92,16 @@ class Ring:
 
     def latest(self, count: int) -> bytes:
         """Return up to ``count`` newest records without taking them; for viewers, at any time."""
+        return self.since(max(0, self.header[HEAD_AT] - count))[0]
+
+    def since(self, start: int) -> tuple[bytes, int]:
+        """Return the records from number ``start`` on that are still there, and where to go on."""
         head = self.header[HEAD_AT]
-        start = max(0, head - min(count, self.capacity - 1))
+        start = min(max(start, head - self.capacity + 1, 0), head)
         out = self._copy(start, head)
         # what the producer overwrote while this copied is cut off; it may be at work on one more
         oldest_whole = self.header[HEAD_AT] + 1 - self.capacity
-        return out[max(0, oldest_whole - start) * self.record_size :]
+        return out[max(0, oldest_whole - start) * self.record_size :], head
 
     def _copy(self, start: int, end: int) -> bytes:
         """The bytes of records ``start`` to ``end`` (counted from the ring's beginning)."""

@@ -1,0 +1,38 @@
+"""``hil watch``: a running run, live."""
+
+from __future__ import annotations
+
+import argparse
+
+from hil.commands.common import Commands, print_json, say
+
+
+def register(commands: Commands) -> None:
+    """Add what this module offers."""
+    command = commands.add("watch", cmd_watch, "Watch a run of this user live; the run never waits for it.")
+    command.add_argument(
+        "run_name", nargs="?", metavar="RUN", help="PID, channel or log; needed with several runs"
+    )
+    command.add_argument("--once", action="store_true", help="print one frame and leave")
+
+
+def cmd_watch(args: argparse.Namespace) -> int:
+    """Watch a run."""
+    from hil.watch import terminal
+    from hil.watch.look import Look, figures
+    from hil.watch.registry import choose
+
+    look = Look(choose(args.run_name))
+    try:
+        if args.json:
+            ticks = look.latest(look.entry.rate_hz)
+            print_json(
+                {**figures(look, ticks), "pid": look.entry.pid, "bus": look.entry.bus, "log": look.entry.log}
+            )
+        elif args.once:
+            terminal.once(look)
+        else:
+            say(f"hil: {terminal.live(look)}")
+    finally:
+        look.close()
+    return 0

@@ -1,0 +1,114 @@
+"""One viewer's look at a run: new ticks and events since the last look, and numbers of the newest ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.log.errors import LogError
+from hil.log.info import info
+from hil.log.records import EVENT, EVENT_BYTES
+from hil.log.ring import RingError, attach
+from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
+from hil.watch.registry import Entry, WatchError, ask_stop, is_alive
+
+Event = tuple[int, int, str, str]
+"""t_ns, tick, kind, text."""
+
+
+def unpack_events(raw: bytes) -> list[Event]:
+    """Events from the records of their ring."""
+    found = []
+    for at in range(0, len(raw), EVENT_BYTES):
+        t_ns, k, kind_size, size = EVENT.unpack_from(raw, at)
+        start = at + EVENT.size
+        middle, end = start + kind_size, start + kind_size + size
+        kind, text = raw[start:middle], raw[middle:end]
+        found.append((t_ns, k, kind.decode(errors="replace"), text.decode(errors="replace")))
+    return found
+
+
+class Look:
+    """A viewer's end of a run's rings, opened read-only. Raises WatchError when they can't be opened."""
+
+    def __init__(self, entry: Entry) -> None:
+        self.entry = entry
+        try:
+            self._ticks = attach(entry.pid, "ticks")
+            try:
+                self._events = attach(entry.pid, "events")
+            except RingError:
+                self._ticks.close()
+                raise
+        except RingError as error:
+            raise WatchError(str(error)) from error
+        self._seen = 0
+
+    def new_ticks(self) -> TickArray:
+        """The ticks since the last look, at most what the ring holds."""
+        raw, self._seen = self._ticks.since(self._seen)
+        return ticks_from(raw)
+
+    def latest(self, count: int) -> TickArray:
+        """The newest ticks."""
+        return ticks_from(self._ticks.latest(count))
+
+    def events(self, count: int) -> list[Event]:
+        """The newest events, oldest first."""
+        return unpack_events(self._events.latest(count))
+
+    @property
+    def dropped(self) -> int:
+        """Records that the log's ring had no room for."""
+        return self._ticks.dropped
+
+    @property
+    def alive(self) -> bool:
+        """True while the run's process is there."""
+        return is_alive(self.entry)
+
+    def stop(self, who: str) -> str:
+        """Ask for an orderly stop; say in a few words what came of it."""
+        newest = self.latest(1)
+        if len(newest) and int(newest["request"][-1]) >= Request.STOP:
+            return "stopping already"
+        t_ns, k = (int(newest[name][-1]) for name in ("t_ns", "k")) if len(newest) else (0, 0)
+        return "stop asked" if ask_stop(self.entry, who, t_ns, k) else "asked already, or ended"
+
+    def close(self) -> None:
+        """Let go of the rings."""
+        self._ticks.close()
+        self._events.close()
+
+
+def figures(look: Look, ticks: TickArray) -> dict[str, Any]:
+    """Numbers of the newest ticks: SI units, lateness in us, rate in Hz (None before two ticks)."""
+    if not len(ticks):
+        return {"k": 0, "state": "arming", "reason": "", "dropped": look.dropped}
+    t = ticks[-1]
+    late = np.percentile(ticks["lateness_ns"] * 1e-3, (50, 99, 100))
+    span_s = (int(t["t_ns"]) - int(ticks["t_ns"][0])) * 1e-9
+    names = ("w", "w_ref", "i_q", "i_d", "u_q", "u_d", "T_L_hat", "v_dc")
+    return {
+        "k": int(t["k"]),
+        "state": DriveState(int(t["state"])).name.lower(),
+        "reason": Reason(int(t["reason"])).name.lower() if t["reason"] else "",
+        **{name: float(t[name]) for name in names},
+        "lateness_us": {
+            name: round(float(v), 1) for name, v in zip(("p50", "p99", "max"), late, strict=True)
+        },
+        "rate_hz": round((len(ticks) - 1) / span_s, 1) if span_s > 0 else None,
+        "skipped": int(ticks["skipped"].sum()),
+        "dropped": look.dropped,
+    }
+
+
+def outcome(log: str) -> str:
+    """How a run ended, by its log."""
+    try:
+        found = info(Path(log))
+    except (LogError, OSError) as error:
+        return f"its log can't be read: {error}"
+    return found.metadata.get("result", {}).get("ended") or "its log has no result"

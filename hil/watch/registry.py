@@ -1,0 +1,193 @@
+"""Which runs of this user are running: one small file each in a folder that only the user can open.
+
+The file is written before the loop starts and removed after its end. A run that was killed leaves its file;
+it is recognised by process id and start time, and removed by whoever looks next. A stop is asked for by a
+note beside that file, which says who asked, and the signal that already means an orderly stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import stat
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.errors import HilError
+
+
+class WatchError(HilError, RuntimeError):
+    """There is no such run, or it can't be looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A running run. ``start``: clock ticks after boot, so that a reused process id is no mistake."""
+
+    pid: int
+    start: int
+    log: str
+    bus: str
+    rate_hz: int
+    ticks: int | None = None
+
+    def __str__(self) -> str:
+        return f"PID {self.pid} on {self.bus}, log {self.log}"
+
+
+def folder() -> Path:
+    """The registry's folder, made when missing. Raises WatchError when others could write into it."""
+    base = os.environ.get("XDG_RUNTIME_DIR")
+    path = Path(base) / "hil" if base else Path(tempfile.gettempdir()) / f"hil-{os.getuid()}"
+    try:
+        path.mkdir(mode=0o700, exist_ok=True)
+        found = path.lstat()
+    except OSError as error:
+        raise WatchError(f"{path}: can't be used for the list of runs ({error.strerror})") from error
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise WatchError(f"{path}: is not a folder that only this user can open; remove it")
+    return path
+
+
+def start_time(pid: int) -> int | None:
+    """Start of a process in clock ticks after boot; None when there is none (a zombie has ended)."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    fields = text.rpartition(")")[2].split()  # the name before it may hold anything
+    return None if fields[0] in "ZX" else int(fields[19])
+
+
+def is_alive(entry: Entry) -> bool:
+    """True while that very process runs."""
+    return start_time(entry.pid) == entry.start
+
+
+def _write_new(path: Path, value: Any) -> None:
+    """Write a file that only this user can read; whole or not there. Raises FileExistsError."""
+    fd, name = tempfile.mkstemp(dir=path.parent, prefix=".")  # 0600 from the beginning
+    try:
+        with os.fdopen(fd, "w", encoding="utf-8") as file:
+            json.dump(value, file)
+        os.link(name, path)
+    finally:
+        Path(name).unlink()
+
+
+def own_entry(log: Path, bus: str, rate_hz: int, ticks: int | None) -> Entry:
+    """The entry of this process."""
+    return Entry(os.getpid(), start_time(os.getpid()) or 0, str(log), bus, rate_hz, ticks)
+
+
+@contextlib.contextmanager
+def announced(entry: Entry) -> Iterator[None]:
+    """List the run while the block runs. A folder that can't be used is no reason not to run."""
+    path: Path | None = None
+    with contextlib.suppress(WatchError, OSError):
+        path = folder() / f"{entry.pid}.json"
+        for old in (path, path.with_suffix(".stop")):
+            old.unlink(missing_ok=True)
+        _write_new(path, asdict(entry))
+    try:
+        yield
+    finally:
+        if path is not None:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+
+def runs() -> list[Entry]:
+    """All running runs of this user, oldest first; what is left of dead ones is removed."""
+    found = []
+    for path in sorted(folder().glob("*.json")):
+        entry = _read(path)
+        if entry is not None and is_alive(entry):
+            found.append(entry)
+        else:
+            path.unlink(missing_ok=True)
+            path.with_suffix(".stop").unlink(missing_ok=True)
+    return sorted(found, key=lambda entry: entry.start)
+
+
+def _read(path: Path) -> Entry | None:
+    try:
+        return Entry(**json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def matching(wanted: str | None) -> list[Entry]:
+    """Runs whose PID, log, bus or channel is ``wanted``; all when it is None."""
+    if wanted is None:
+        return runs()
+    log = str(Path(wanted).resolve())
+    return [
+        e
+        for e in runs()
+        if wanted in (str(e.pid), e.bus, e.bus.partition(":")[2], Path(e.log).stem) or log == e.log
+    ]
+
+
+def choose(wanted: str | None) -> Entry:
+    """The one run that is meant. Raises WatchError when there is none or more than one."""
+    found = matching(wanted)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        which = "\n".join(f"  {entry}" for entry in found)
+        raise WatchError(f"{len(found)} runs: say which by PID, channel or log\n{which}")
+    if wanted is None:
+        raise WatchError("no run of this user is running; start one: hil run CONFIG")
+    if wanted.isdigit():
+        raise WatchError(_why_not(int(wanted)))
+    raise WatchError(f"no run with PID, channel or log {wanted!r} is running")
+
+
+def _why_not(pid: int) -> str:
+    """Why a process id is none of ours."""
+    try:
+        owner = Path(f"/proc/{pid}").stat().st_uid
+    except OSError:
+        return f"process {pid}: there is none"
+    if owner != os.getuid():
+        return f"process {pid} belongs to another user (uid {owner}); only its owner can watch it"
+    return f"process {pid} is no hil run"
+
+
+def ask_stop(entry: Entry, who: str, t_ns: int, k: int) -> bool:
+    """Ask a run for an orderly stop, once; False when somebody has asked or it has ended.
+
+    The process is held by a pidfd before it is checked, so that the signal can't reach another one. A second
+    signal would be a quick stop, hence the note that can be made only once.
+    """
+    path = folder() / f"{entry.pid}.stop"
+    try:
+        fd = os.pidfd_open(entry.pid)
+    except OSError:
+        return False
+    try:
+        if not is_alive(entry) or not path.with_suffix(".json").exists():
+            return False
+        _write_new(path, {"who": who, "t_ns": t_ns, "k": k})
+        signal.pidfd_send_signal(fd, signal.SIGTERM)
+    except (FileExistsError, ProcessLookupError):
+        return False
+    finally:
+        os.close(fd)
+    return True
+
+
+def who_asked(pid: int) -> tuple[int, int, str] | None:
+    """Take the note of a stop: (t_ns, k, who); None when there is none."""
+    with contextlib.suppress(WatchError, OSError, ValueError, KeyError, TypeError):
+        path = folder() / f"{pid}.stop"
+        note = json.loads(path.read_text(encoding="utf-8"))
+        path.unlink()
+        return int(note["t_ns"]), int(note["k"]), str(note["who"])
+    return None

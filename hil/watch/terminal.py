@@ -1,0 +1,149 @@
+"""A run live in a terminal: sparklines, state, timing, events; q leaves, s stops the run."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from hil.arming import keys_at_once
+from hil.signals import TickArray
+from hil.watch.look import Event, Look, figures, outcome
+from hil.watch.registry import Entry
+
+REFRESH_S: Final = 0.25
+SHOWN_S: Final = 3.5  # the ring holds 4 s
+BLOCKS: Final = "▁▂▃▄▅▆▇█"
+ROWS: Final = (
+    ("speed", "w", "rad/s", "cyan", 1.0),
+    ("reference", "w_ref", "rad/s", "blue", 1.0),
+    ("current q", "i_q", "A", "yellow", 0.2),
+    ("current d", "i_d", "A", "magenta", 0.2),
+    ("load estimate", "T_L_hat", "N m", "green", 0.2),
+    ("lateness", "lateness_ns", "us", "red", 10.0),
+)
+"""Label, field, unit, colour, and the smallest span that fills the height."""
+STATE_STYLES: Final = {
+    "operation_enabled": "bold green",
+    "fault": "bold red",
+    "quick_stop_active": "bold yellow",
+}
+
+
+def sparkline(values: npt.NDArray[np.float64], width: int, least_span: float) -> str:
+    """``width`` characters; of each share of the values the one farthest from their median is drawn."""
+    finite = values[np.isfinite(values)]
+    if not len(finite) or width < 1:
+        return ""
+    middle, low, high = float(np.median(finite)), float(finite.min()), float(finite.max())
+    spare = max(0.0, least_span - (high - low)) / 2
+    low, span = low - spare, max(high - low + 2 * spare, 1e-12)
+    shares = np.array_split(finite, min(width, len(finite)))
+    drawn = (share[np.argmax(np.abs(share - middle))] for share in shares)
+    top = len(BLOCKS) - 1
+    return "".join(BLOCKS[round(min(max((value - low) / span, 0.0), 1.0) * top)] for value in drawn)
+
+
+def curves(ticks: TickArray, width: int) -> Table:
+    """One row a signal: newest value, sparkline, smallest and largest."""
+    table = Table.grid(padding=(0, 1))
+    for justify in ("left", "right", "left", "left", "right"):
+        table.add_column(justify=justify, no_wrap=True)
+    for label, name, unit, colour, least in ROWS:
+        values = ticks[name].astype(np.float64) * (1e-3 if unit == "us" else 1.0)
+        if len(values):
+            line = Text(sparkline(values, max(10, width - 56), least), style=colour)
+            ends = f"{values.min():.2f} .. {values.max():.2f}"
+            table.add_row(label, f"{values[-1]:.2f}", Text(unit, style="dim"), line, Text(ends, style="dim"))
+    return table
+
+
+def _state(look: Look, ticks: TickArray) -> Text:
+    now = figures(look, ticks)
+    state, reason = now["state"], now["reason"]
+    text = Text(state.replace("_", " "), style=STATE_STYLES.get(state, "bold"))
+    if reason:
+        text.append(f"  ({reason.replace('_', ' ')})", style="bold yellow")
+    total = f" of {look.entry.ticks}" if look.entry.ticks else ""
+    text.append(f"   tick {now['k']}{total}", style="default")
+    if now.get("rate_hz"):
+        late = now["lateness_us"]
+        text.append(f"   {now['rate_hz']:.0f} Hz of {look.entry.rate_hz}")
+        text.append(f"\nlateness p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} us   ")
+        text.append(f"{now['skipped']} skipped", style="yellow" if now["skipped"] else "default")
+        text.append(f"   {now['dropped']} dropped", style="red" if now["dropped"] else "default")
+    return text
+
+
+def _events(events: list[Event], entry: Entry) -> Text:
+    """The newest events, one a line."""
+    lines = [f"tick {k:<8d} {kind:12s} {text}" for _, k, kind, text in events]
+    return Text("\n".join(lines) or f"no events yet on {entry.bus}", overflow="ellipsis", no_wrap=True)
+
+
+def frame(look: Look, width: int, note: str = "") -> RenderableType:
+    """The whole view."""
+    ticks = look.latest(round(SHOWN_S * look.entry.rate_hz))
+    entry = look.entry
+    body = Group(
+        _state(look, ticks),
+        Text(""),
+        curves(ticks, width),
+        Text(""),
+        _events(look.events(5), entry),
+        Text(f"\nlog {entry.log}", style="dim", overflow="fold"),
+    )
+    return Panel(
+        body, title=f"hil run  PID {entry.pid}  {entry.bus}", subtitle=note or None, title_align="left"
+    )
+
+
+def once(look: Look) -> None:
+    """Print one frame."""
+    console = Console()
+    width = console.width if console.is_terminal else 110
+    Console(width=width).print(frame(look, width))
+
+
+def _key(wait_s: float) -> str:
+    """The key pressed within a time; empty when none or when standard input is no terminal."""
+    if not sys.stdin.isatty():
+        select.select([], [], [], wait_s)
+        return ""
+    if not select.select([sys.stdin], [], [], wait_s)[0]:
+        return ""
+    return os.read(sys.stdin.fileno(), 64).decode(errors="replace")[:1] or "q"
+
+
+def who(kind: str) -> str:
+    """This viewer, for the log."""
+    return f"hil watch in the {kind}, user id {os.getuid()}, process {os.getpid()}"
+
+
+def live(look: Look) -> str:
+    """Show the run until it ends or q is pressed; say what came of it."""
+    console = Console()
+    note, asking = "q leaves, s stops the run", False
+    with (
+        keys_at_once(sys.stdin.fileno()),
+        Live(console=console, auto_refresh=False, screen=console.is_terminal) as shown,
+    ):
+        while look.alive:
+            shown.update(frame(look, console.width, note), refresh=True)
+            key = _key(REFRESH_S)
+            if asking and key:
+                note, asking = look.stop(who("terminal")) if key == "y" else "not stopped", False
+            elif key == "s":
+                note, asking = "stop the run? y stops it, any other key does not", True
+            elif key == "q":
+                return "left; the run goes on"
+    return f"the run has ended: {outcome(look.entry.log)}"

@@ -1,0 +1,87 @@
+"""`hil watch` beside a real run: what it shows, its stop, and that it costs the run nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.app import Overrides
+from hil.demo import emulator_process
+from hil.log.reader import open_log
+from hil.signals import DriveState
+from hil.watch.look import Look, outcome
+from hil.watch.registry import choose
+from tests.process.test_run import call, flags, hil, only_log, voltages_after_stop, wait_for_log
+
+pytestmark = pytest.mark.process
+Settings = Callable[..., tuple[str, ...]]
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def opened_by(pid: int) -> set[str]:
+    return {str(link.readlink()) for link in Path(f"/proc/{pid}/fd").iterdir()}
+
+
+def test_a_run_is_seen_stopped_and_says_who_stopped_it(
+    configs: Path, settings: Settings, tmp_path: Path, channel: str
+) -> None:
+    own = settings("loop.duration_s=60.0")
+    path = configs / "demo.toml"
+    with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
+        wait_for_log(tmp_path)
+        before = opened_by(process.pid)
+        seen = call("watch", channel, "--json")
+        assert seen.returncode == 0, seen.stderr
+        now = json.loads(seen.stdout)
+        assert now["pid"] == process.pid and now["state"] == "operation_enabled" and now["k"] > 0
+        assert set(now["lateness_us"]) == {"p50", "p99", "max"} and now["dropped"] == 0
+        shown = call("watch", "--once").stdout
+        assert all(
+            word in shown for word in ("operation enabled", "speed", "load estimate", channel, "state")
+        )
+        assert "\x1b" not in shown
+        look = Look(choose(None))
+        first, more = look.new_ticks(), look.new_ticks()
+        assert np.all(np.diff(first["k"].astype(np.int64)) > 0)
+        assert not set(first["k"]) & set(more["k"])
+        assert opened_by(process.pid) == before  # the run has no descriptor, socket or thread for viewers
+        assert look.stop("a test") == "stop asked"
+        process.communicate(timeout=60)
+        assert process.returncode == 0 and not look.alive
+        look.close()
+    log = open_log(only_log(tmp_path))
+    assert outcome(str(log.path)) == "stop_requested"
+    assert (voltages_after_stop(log.path) == 0).all()
+    assert log.ticks["state"][-1] == DriveState.SWITCH_ON_DISABLED
+    assert [event.text for event in log.events if event.kind == "stop-asked"] == ["a test"]
+    gone = call("watch", channel)
+    assert gone.returncode == 2 and "no run with" in gone.stderr
+
+
+def test_no_run_is_one_clear_line() -> None:
+    done = call("watch", "--once")
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.startswith("hil: no run of this user is running")
+
+
+def test_another_users_run_is_refused() -> None:
+    if os.getuid() == 0:
+        other = subprocess.Popen(["sleep", "60"], user=65534)
+    else:
+        pytest.skip("needs root to start a process of another user")
+    try:
+        done = call("watch", str(other.pid))
+        assert done.returncode == 2 and "belongs to another user" in done.stderr
+    finally:
+        other.kill()
+        other.wait()

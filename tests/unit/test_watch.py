@@ -1,0 +1,137 @@
+"""The list of runs, the note of a stop, sparklines: what `hil watch` is made of."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.log.records import pack_event_record
+from hil.log.ring import Ring
+from hil.watch import registry
+from hil.watch.look import Look, unpack_events
+from hil.watch.registry import WatchError, announced, ask_stop, choose, own_entry, runs, who_asked
+from hil.watch.terminal import sparkline
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "hil"
+
+
+def entry(channel: str = "demo") -> registry.Entry:
+    return own_entry(Path("/logs/a.mcap"), f"hil-local:{channel}", 1000, None)
+
+
+def test_a_run_is_listed_while_it_runs_and_only_its_user_can_read_that(own_folder: Path) -> None:
+    with announced(entry()):
+        assert runs() == [entry()]
+        assert own_folder.stat().st_mode & 0o777 == 0o700
+        assert [f.stat().st_mode & 0o777 for f in own_folder.iterdir()] == [0o600]
+        for name in (str(os.getpid()), "demo", "hil-local:demo", "/logs/a.mcap", "a", None):
+            assert choose(name) == entry()
+    assert runs() == [] and not list(own_folder.iterdir())
+
+
+def test_what_a_dead_run_left_is_removed_also_when_its_pid_was_given_again(own_folder: Path) -> None:
+    with announced(replace(entry(), start=entry().start - 1)):
+        (own_folder / f"{os.getpid()}.stop").write_text("{}")
+        assert runs() == [] and not list(own_folder.iterdir())
+
+
+def test_a_damaged_entry_is_no_run(own_folder: Path) -> None:
+    runs()
+    for name, text in (("1.json", "{"), ("2.json", '{"pid": 2}'), ("3.json", "[]"), ("4.json", "\x00")):
+        (own_folder / name).write_text(text)
+    assert runs() == [] and not list(own_folder.iterdir())
+
+
+def test_a_folder_that_others_can_open_is_refused_but_the_run_goes_on(own_folder: Path) -> None:
+    own_folder.mkdir()
+    own_folder.chmod(0o755)
+    with pytest.raises(WatchError, match="only this user"):
+        runs()
+    with announced(entry()):
+        assert not list(own_folder.iterdir())
+
+
+def test_a_link_in_place_of_the_folder_is_refused(own_folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir(mode=0o700)
+    own_folder.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(WatchError):
+        runs()
+
+
+def test_refusals_say_which_or_why(own_folder: Path) -> None:
+    with pytest.raises(WatchError, match="no run of this user"):
+        choose(None)
+    with pytest.raises(WatchError, match="no run with PID, channel or log 'other'"):
+        choose("other")
+    with pytest.raises(WatchError, match="is no hil run"):
+        choose(str(os.getpid()))
+    with pytest.raises(WatchError, match="there is none"):
+        choose("99999999")
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        second = replace(entry("b"), pid=other.pid, start=registry.start_time(other.pid) or 0)
+        with announced(entry()), announced(second):
+            with pytest.raises(WatchError, match=rf"2 runs: say which(.|\n)*{other.pid} on hil-local:b"):
+                choose(None)
+            assert choose("b") == second
+        other.communicate()
+
+
+def test_a_stop_is_asked_once_and_says_who(own_folder: Path) -> None:
+    asked: list[int] = []
+    before = signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+    try:
+        with announced(entry()):
+            assert ask_stop(entry(), "me", 5, 6)
+            assert not ask_stop(entry(), "another", 7, 8)  # a second signal would be a quick stop
+            assert who_asked(os.getpid()) == (5, 6, "me")
+            assert who_asked(os.getpid()) is None
+        assert not ask_stop(entry(), "too late", 7, 8)
+        assert not ask_stop(replace(entry(), start=1), "another process", 7, 8)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert asked == [signal.SIGTERM]
+
+
+def test_a_process_without_rings_is_refused() -> None:
+    with pytest.raises(WatchError, match="no ring"):
+        Look(entry())
+
+
+def test_events_come_back_from_their_records() -> None:
+    raw = pack_event_record(1, 2, "state", "äh") + pack_event_record(3, 4, "stop", "")
+    assert unpack_events(raw) == [(1, 2, "state", "äh"), (3, 4, "stop", "")]
+
+
+def test_since_gives_each_record_once_and_skips_what_is_gone() -> None:
+    ring, seen, got = Ring.create("t", 8, 8), 0, []
+    sizes = (3, 0, 5, 1, 20, 2)  # 20 is more than it holds
+    number = 0
+    for size in sizes:
+        for _ in range(size):
+            ring.push(number.to_bytes(8, "little"))
+            ring.take(final=True)
+            number += 1
+        raw, seen = ring.since(seen)
+        got += np.frombuffer(raw, "<u8").tolist()
+    ring.close()
+    assert got == [*range(9), *range(22, 29), 29, 30]
+
+
+def test_a_spike_shows_in_a_sparkline_and_a_constant_is_flat() -> None:
+    values = np.zeros(3000)
+    values[1234] = 9.0
+    line = sparkline(values, 60, 1.0)
+    assert len(line) == 60 and line.count("█") == 1 and line.count("▁") == 59
+    assert len(set(sparkline(np.full(100, 7.0), 20, 1.0))) == 1
+    assert sparkline(np.full(5, np.nan), 20, 1.0) == ""
