@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,7 @@ from hil.log.schema import (
     message_layout,
     unpack_event,
 )
-from hil.signals import TICK, TickArray, new_ticks
+from hil.signals import FIELDS, TICK, TickArray, new_ticks
 
 __all__ = ["Frame", "Log", "LogError", "open_log", "read_blocks"]
 
@@ -53,7 +53,7 @@ class Frame(NamedTuple):
 
 
 class Block(NamedTuple):
-    """What one chunk brought: tick records or FRAME records of one direction."""
+    """What one chunk brought: tick records, or FRAME records in the order of the file."""
 
     kind: Literal["ticks", "frames"]
     records: Records
@@ -82,6 +82,30 @@ class Log:
         except ValueError:
             return {}
         return out if isinstance(out, dict) else {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing is held open; the block only shows how long the log is used."""
+
+    def to_numpy(self) -> TickArray:
+        """The ticks as a plain structured array: the named fields alone, exact."""
+        names = [field.name for field in FIELDS]
+        out = np.empty(len(self.ticks), [(name, self.ticks.dtype[name]) for name in names])
+        for name in names:
+            out[name] = self.ticks[name]
+        return out
+
+    def to_pandas(self, *, names: bool = False) -> Any:
+        """The ticks as a DataFrame indexed by the time since the first [s]; units in ``df.attrs["units"]``.
+
+        ``names``: states, reasons and requests as categories with their names instead of numbers.
+        Raises LogError when pandas is not installed.
+        """
+        from hil.convert.frame import data_frame
+
+        return data_frame(self, names=names)
 
     @property
     def gaps(self) -> list[tuple[int, int]]:
@@ -181,8 +205,13 @@ class _Pass:
             raise DamagedError("a message is too short")
         raw = np.frombuffer(data, np.uint8)
         channel = raw[messages[:, 1]].astype(np.int64) | raw[messages[:, 1] + 1].astype(np.int64) << 8
-        for number in np.unique(channel).tolist():
+        ways = {n: topic == "/can/rx" for n, topic in self._topics.items() if topic in ("/can/rx", "/can/tx")}
+        is_frame = np.isin(channel, list(ways))
+        for number in np.unique(channel[~is_frame]).tolist():
             yield from self._messages(self._topics.get(number, ""), data, messages[channel == number])
+        if is_frame.any():
+            received = np.isin(channel[is_frame], [number for number, rx in ways.items() if rx])
+            yield self._frames(data, messages[is_frame], received)
 
     def _uniform(self, data: bytes) -> TickArray | None:
         """The ticks of a chunk that holds nothing else, as this program writes it; None for any other."""
@@ -201,17 +230,20 @@ class _Pass:
             if (lengths != TICK.itemsize).any():
                 raise LogError(f"{self.log.path}: tick records of another length than {TICK.itemsize} bytes")
             yield self._ticks(_gather(data, starts, TICK))
-        elif topic in ("/can/rx", "/can/tx"):
-            if (lengths < FRAME_HEAD).any():
-                raise DamagedError("a frame message is too short")
-            messages = _gather(data, starts, FRAME_MESSAGE)
-            try:
-                yield Block("frames", frames_from_messages(messages, lengths, topic == "/can/rx"))
-            except ValueError as error:
-                raise DamagedError(str(error)) from error
         elif topic == "/event":
             for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
                 self._event(data[start : start + length])
+
+    def _frames(self, data: bytes, rows: Rows, received: npt.NDArray[np.bool_]) -> Block:
+        """The frames of a chunk, both ways, in the order in which they passed the loop."""
+        lengths = rows[:, 2] - FIXED_BYTES
+        if (lengths < FRAME_HEAD).any():
+            raise DamagedError("a frame message is too short")
+        try:
+            messages = _gather(data, rows[:, 1] + FIXED_BYTES, FRAME_MESSAGE)
+            return Block("frames", frames_from_messages(messages, lengths, received))
+        except ValueError as error:
+            raise DamagedError(str(error)) from error
 
     def _event(self, raw: bytes) -> None:
         try:
@@ -322,8 +354,9 @@ class _Kept:
         return out.view(TICK)
 
 
-def open_log(path: Path, *, frames: bool = True) -> Log:
+def open_log(path: Path | str, *, frames: bool = True) -> Log:
     """Read a log up to and around its damage. Raises LogError for what is no log of hil at all."""
+    path = Path(path)
     log = Log(path, new_ticks(0))
     if not path.is_file():
         raise LogError(f"{path}: no such file")

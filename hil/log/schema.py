@@ -157,7 +157,9 @@ def frame_messages(frames: Records) -> Records:
     return out
 
 
-def frames_from_messages(messages: Records, lengths: npt.NDArray[np.int64], received: bool) -> Records:
+def frames_from_messages(
+    messages: Records, lengths: npt.NDArray[np.int64], received: npt.NDArray[np.bool_] | bool
+) -> Records:
     """Inverse of :func:`frame_messages`. Raises ValueError when bytes are no message of ours."""
     if any((messages[name] != tag).any() for name, tag in FRAME_TAGS) or (messages["size"] > 64).any():
         raise ValueError("not a frame message")

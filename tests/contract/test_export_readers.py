@@ -1,0 +1,186 @@
+"""Exported logs in other people's readers: pyarrow, pandas, scipy, asammdf, python-can; equal to the bit."""
+
+from __future__ import annotations
+
+import csv
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+import hil
+from hil.cli import main
+from hil.convert import export as module
+from hil.convert.export import export
+from hil.convert.frame import MissingPackage, need
+from hil.log.errors import LogError
+from hil.log.schema import Records
+from hil.signals import FIELDS, DriveState
+from tests.logfiles import some_frames, some_ticks, write_log
+
+NAMES = [field.name for field in FIELDS]
+
+
+def odd_ticks() -> Any:
+    """Ticks with every value that a format likes to spoil."""
+    ticks = some_ticks(500)
+    ticks["w"][:6] = [np.nan, np.inf, -np.inf, -0.0, 5e-324, 0.1 + 0.2]
+    ticks["k"][-1] = ticks["k"][-2] + 2**53
+    ticks["t_ns"] += 2**60 + 1
+    ticks["state"] = 4
+    return ticks
+
+
+def valid_frames() -> Records:
+    """Frames whose lengths a bus can carry; some extended, some remote; more than a millisecond apart."""
+    frames = some_frames(2000)
+    frames["size"] = np.array([0, 1, 7, 8, 12, 64])[np.arange(2000) % 6]
+    frames["data"] = np.where(np.arange(64)[None, :] < frames["size"][:, None], frames["data"], 0)
+    frames["can_id"][::5] |= 0x80000000 | 0x12340000
+    return frames
+
+
+TICKS, FRAMES = odd_ticks(), valid_frames()
+
+
+@pytest.fixture(params=[10, 1 << 16], ids=["many slabs", "one slab"])
+def path(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(module, "SLAB", request.param)
+    write_log(tmp_path / "run.mcap", TICKS, FRAMES)
+    return tmp_path / "run.mcap"
+
+
+def same_bits(found: Any, name: str) -> bool:
+    """Values and kind of a column are those of the log; NaN is NaN."""
+    own = np.ascontiguousarray(TICKS[name])
+    return found.dtype == own.dtype and found.tobytes() == own.tobytes()
+
+
+def test_parquet(path: Path, tmp_path: Path) -> None:
+    import pyarrow.parquet as pq
+
+    assert export(path, tmp_path / "a.parquet").records == len(TICKS)
+    table = pq.read_table(tmp_path / "a.parquet")
+    assert table.column_names == NAMES
+    assert all(same_bits(table[name].to_numpy(), name) for name in NAMES)
+    assert table.schema.field("w").metadata[b"unit"] == b"rad/s"
+    assert pq.ParquetFile(tmp_path / "a.parquet").num_row_groups == (10 if module.SLAB == 10 else 1)
+
+
+def test_csv_round_trips_every_number(path: Path, tmp_path: Path) -> None:
+    export(path, tmp_path / "a.csv")
+    with (tmp_path / "a.csv").open(newline="") as stream:
+        head, *rows = csv.reader(stream)
+    assert head[NAMES.index("T_L_hat")] == "T_L_hat [N m]" and head[0] == "k"
+    for field, column in zip(FIELDS, zip(*rows, strict=True), strict=True):
+        kind = float if field.kind == "f8" else int
+        assert same_bits(np.array([kind(text) for text in column], f"<{field.kind}"), field.name)
+
+
+def test_mat(path: Path, tmp_path: Path) -> None:
+    from scipy.io import loadmat
+
+    export(path, tmp_path / "a.mat")
+    found = loadmat(tmp_path / "a.mat", squeeze_me=True)
+    assert all(same_bits(found[name], name) for name in NAMES)
+    assert str(found["units"]["i_q"]) == "A" and str(found["run"]["clock"]) == "lockstep"
+
+
+def test_mf4(path: Path, tmp_path: Path) -> None:
+    from asammdf import MDF
+
+    export(path, tmp_path / "a.mf4")
+    with MDF(tmp_path / "a.mf4") as file:
+        for field in FIELDS:
+            signal = file.get(field.name)
+            assert same_bits(signal.samples, field.name) and signal.unit == field.unit
+        assert np.array_equal(file.get("w").timestamps, (TICKS["t_ns"] - TICKS["t_ns"][0]) * 1e-9)
+
+
+READERS: dict[str, Callable[[Path], Any]] = {
+    ".log": can.CanutilsLogReader,
+    ".asc": can.ASCReader,
+    ".blf": can.BLFReader,
+}
+
+
+@pytest.mark.parametrize("ending", list(READERS))
+def test_recordings_hold_every_frame_in_order(path: Path, tmp_path: Path, ending: str) -> None:
+    out = tmp_path / f"a{ending}"
+    export(path, out)
+    with READERS[ending](out) as reader:
+        seen = list(reader)
+    assert len(seen) == len(FRAMES)
+    for frame, message in zip(FRAMES, seen, strict=True):
+        number, extended = int(frame["can_id"]) & 0x1FFFFFFF, bool(frame["can_id"] & 0x80000000)
+        assert (message.arbitration_id, message.is_extended_id) == (number, extended)
+        assert bytes(message.data) == bytes(frame["data"][: frame["size"]])
+        assert message.is_rx == bool(frame["received"]) and message.is_fd == (frame["size"] > 8)
+    passed = np.array([message.timestamp for message in seen]) - seen[0].timestamp
+    assert np.abs(passed - (FRAMES["t_ns"] - FRAMES["t_ns"][0]) * 1e-9).max() < 2e-6
+
+
+def test_data_frame_in_two_lines(path: Path) -> None:
+    with hil.open_log(str(path)) as log:
+        frame = log.to_pandas()
+        named = log.to_pandas(names=True)
+        plain = log.to_numpy()
+    assert all(same_bits(frame[name].to_numpy(), name) and same_bits(plain[name], name) for name in NAMES)
+    assert frame.attrs["units"]["w"] == "rad/s" and frame.index[1] == pytest.approx(1e-3)
+    assert set(named["state"]) == {DriveState.OPERATION_ENABLED.name} and plain.dtype.names == tuple(NAMES)
+
+
+def test_nothing_is_replaced_without_force(path: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "a.csv"
+    out.write_text("mine")
+    assert main(["export", str(path), "-o", str(out)]) == 2 and "--force" in capsys.readouterr().err
+    assert out.read_text() == "mine"
+    assert main(["export", str(path), "-o", str(out), "--force"]) == 0 and out.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("ending", [*module.FORMATS, module.MAT])
+def test_what_fails_leaves_nothing_behind(tmp_path: Path, ending: str) -> None:
+    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
+    with pytest.raises(LogError):
+        export(tmp_path / "bad.mcap", tmp_path / f"a{ending}")
+    assert [p.name for p in tmp_path.iterdir()] == ["bad.mcap"]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".log", ".blf", ".parquet"])
+def test_a_full_disk_is_one_clear_line(path: Path, tmp_path: Path, ending: str) -> None:
+    """A limit on the size of files stands in for the full disk: the same write fails, by the kernel."""
+    out = tmp_path / f"a{ending}"
+    code = (
+        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000));"
+        "from hil.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "export", str(path), "-o", str(out)],
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2 and "can't be written" in done.stderr, done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
+def test_a_log_cut_off_is_exported_as_far_as_it_goes(path: Path, tmp_path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    found = export(path, tmp_path / "a.csv")
+    assert 0 < found.records < len(TICKS) and found.damage is not None
+
+
+def test_other_endings_and_missing_packages_are_named(path: Path, tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"\.parquet"):
+        export(path, tmp_path / "a.xyz")
+    with pytest.raises(MissingPackage, match=r"pip install 'hil-drive\[export\]'"):
+        need("no_such_package.part", "This")
+
+
+def test_import_hil_stays_light() -> None:
+    code = "import hil, sys; print(sorted({'numpy', 'numba', 'pandas', 'pyarrow', 'can'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
