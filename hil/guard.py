@@ -54,6 +54,7 @@ SAFETY_STATE: Final = np.dtype(
         ("state", "i8"),
         ("reason", "i8"),
         ("armed_ticks", "i8"),
+        ("word", "i8"),
         ("run_ticks", "i8"),
         ("stop_ticks", "i8"),
         ("stale", "i8"),

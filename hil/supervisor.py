@@ -129,8 +129,11 @@ def begin_stop(s: Any, reason: int) -> None:
 def handshake(p: Any, s: Any, t: Any) -> int:
     """Follow the drive through its enable handshake; return the controlword for its state.
 
-    A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words.
+    A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words. Without
+    fresh feedback the last word stands: another would undo the step that the drive may just have made.
     """
+    if not t["rx_flags"] & RxFlag.FRESH and s["armed_ticks"] > 1:
+        return int(s["word"])
     if t["rx_flags"] & RxFlag.FRESH:
         if t["drive_state"] == DriveState.OPERATION_ENABLED:
             s["state"] = DriveState.OPERATION_ENABLED.value
@@ -155,7 +158,8 @@ def arming(p: Any, s: Any, t: Any) -> int:
     if reason != 0:
         begin_stop(s, reason)
         return Controlword.DISABLE_VOLTAGE.value
-    return int(handshake(p, s, t))
+    s["word"] = handshake(p, s, t)
+    return int(s["word"])
 
 
 @jit

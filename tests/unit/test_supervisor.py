@@ -288,3 +288,17 @@ def _random_rows(rng: np.random.Generator, count: int) -> Iterable[dict[str, Any
             "w_ref": rng.choice(strange) if odd else 50.0,
             "request": int(rng.choice([1, 1, 1, 1, 3, 4])) if rng.random() < 0.02 else 1,
         }
+
+
+def test_lost_feedback_does_not_undo_a_step_of_the_handshake(bench: Bench) -> None:
+    """Another word than the last would take the drive back while the controller thinks that it is on."""
+    words = []
+    for k in range(12):
+        flags = 0 if k % 2 else FRESH
+        t = bench.step(flags)
+        words.append((int(t["state"]), int(t["controlword"])))
+        if t["state"] == DriveState.OPERATION_ENABLED:
+            break
+    assert words[-1][0] == DriveState.OPERATION_ENABLED, words
+    sent = [word for _, word in words]
+    assert sent == sorted(sent), words  # 0x06, 0x07, 0x0F and never back

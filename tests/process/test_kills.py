@@ -1,0 +1,20 @@
+"""A few of `make crash`: every victim once or twice."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import ROOT
+
+pytestmark = [pytest.mark.process, pytest.mark.slow]
+
+
+def test_every_kill_leaves_a_drive_at_rest_and_a_log() -> None:
+    command = [sys.executable, "-m", "tests.crash.kills", "--kills", "8", "--seed", "7"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)
+    print(done.stdout)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "8 of 8 kills survived (controller 2, writer 2, emulator 2, guardian 2)" in done.stdout
