@@ -177,14 +177,34 @@ def is_emulated_bus(config: RunConfig) -> bool:
 
     An interface that is not there is taken by its name; nothing can be armed on it anyway.
     """
-    bus = config.bus
-    if bus.interface != "socketcan":
-        return bus.interface in EMULATED_INTERFACES
+    return _is_emulated(config.bus.interface, config.bus.channel)
+
+
+def _is_emulated(interface: str, channel: str) -> bool:
+    if interface != "socketcan":
+        return interface in EMULATED_INTERFACES
     try:
-        facts = interface_facts(bus.channel)
+        facts = interface_facts(channel)
     except DriverError:
         return False  # nobody can say, so it may be real
-    return facts.kind == "vcan" if facts else bus.channel.startswith("vcan")
+    return facts.kind == "vcan" if facts else channel.startswith("vcan")
+
+
+@contextlib.contextmanager
+def sending_bus(
+    interface: str, channel: str, bitrate: int, fd: bool, *, real_allowed: bool
+) -> Iterator[Callable[[int, bytes, bool], None]]:
+    """A way to send raw frames. Raises ArmingError for a bus that may be real, unless that is allowed."""
+    if not (real_allowed or _is_emulated(interface, channel)):
+        raise ArmingError(
+            f"{interface}:{channel} is no emulated bus and the frames may command a drive; "
+            "nothing was sent. --transmit-commands allows it"
+        )
+    link = open_link(BusSettings(interface, channel, bitrate, None, fd))
+    try:
+        yield link.send
+    finally:
+        link.close()
 
 
 def log_path(setup: Setup, kind: str) -> Path:

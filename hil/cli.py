@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hil.commands import bench, convert, demo, emulated, log, paper, replay, report, run, watch
+from hil.commands import bench, convert, demo, emulated, log, paper, play, replay, report, run, watch
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -21,10 +21,11 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil report LOG [LOG ...]     one page of a run that works offline; several are compared
   hil info LOG, recover LOG    what is in a log; rewrite a damaged one
   hil export LOG -o FILE       ticks as Parquet, CSV, MAT, MF4; frames as candump, ASC, BLF
+  hil play LOG -c vcan0        recorded frames back on a bus with their timing
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, watch, emulated, replay, report, log, convert, paper, bench)
+MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,0 +1,205 @@
+"""Recorded frames back on a bus, each at its absolute deadline. Knows a way to send, no bus.
+
+A command is what the log's own controller sent, by its identifiers; in a shadow run's log or another
+program's recording nobody can say, so every frame may be one.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, Protocol
+
+import can
+import numpy as np
+
+from hil.log.errors import LogError
+from hil.log.reader import Log, read_blocks
+from hil.signals import new_ticks
+
+Send = Callable[[int, bytes, bool], None]
+Direction = Literal["rx", "tx", "both"]
+EXTENDED: Final = 0x80000000
+LATE_NS: Final = 1_000_000
+LEAD_NS: Final = 20_000_000
+_BINS: Final = 100_000
+
+
+class Played(NamedTuple):
+    """A frame to play; ``command``: it may move a drive."""
+
+    t_ns: int
+    can_id: int
+    data: bytes
+    fd: bool
+    command: bool
+
+
+class Sleeper(Protocol):
+    """The clock, as far as playing needs it."""
+
+    def now_ns(self) -> int:
+        """The time [ns]."""
+
+    def sleep_until(self, deadline_ns: int) -> int:
+        """Sleep to the deadline; the time of waking [ns]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Which frames: direction, identifiers (none: all), window [s] from the first frame."""
+
+    direction: Direction = "rx"
+    ids: frozenset[int] = frozenset()
+    not_ids: frozenset[int] = frozenset()
+    from_s: float = 0.0
+    to_s: float = math.inf
+
+    def takes(self, frame: Played, first_ns: int) -> bool:
+        """Whether a frame is played."""
+        number, t_s = frame.can_id & ~EXTENDED, (frame.t_ns - first_ns) * 1e-9
+        return (
+            self.from_s <= t_s <= self.to_s
+            and (not self.ids or number in self.ids)
+            and number not in self.not_ids
+            and (self.direction == "both" or frame.command == (self.direction == "tx"))
+        )
+
+
+@dataclass(slots=True)
+class Result:
+    """What was played and how late, by a histogram of 1 us bins up to 0.1 s."""
+
+    sent: int = 0
+    late: int = 0
+    max_us: float = 0.0
+    interrupted: bool = False
+    _bins: Any = field(default_factory=lambda: np.zeros(_BINS + 1, np.int64))
+
+    def add(self, lateness_ns: int) -> None:
+        """Count a frame."""
+        self.sent += 1
+        self.late += lateness_ns > LATE_NS
+        self.max_us = max(self.max_us, lateness_ns * 1e-3)
+        self._bins[min(max(lateness_ns, 0) // 1000, _BINS)] += 1
+
+    def quantile_us(self, share: float) -> float:
+        """Upper edge of the bin that holds this quantile; the largest value in the last one."""
+        if not self.sent:
+            return 0.0
+        at = int(np.searchsorted(np.cumsum(self._bins), math.ceil(share * self.sent)))
+        return min(at + 1.0, self.max_us)
+
+    def as_dict(self) -> dict[str, Any]:
+        """As a plain dict; times in us."""
+        return {
+            "frames sent": self.sent,
+            "lateness p50 us": self.quantile_us(0.5),
+            "lateness p99 us": self.quantile_us(0.99),
+            "lateness max us": self.max_us,
+            "frames late by over 1 ms": self.late,
+            "interrupted": self.interrupted,
+        }
+
+
+class Source:
+    """Frames of a log of hil (.mcap) or of a recording that python-can reads. Raises LogError."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise LogError(f"{path}: no such file")
+        self.path = path
+        self._ours = path.suffix == ".mcap"
+        self.roles_known, self._own_ids = self._roles() if self._ours else (False, frozenset())
+
+    def _roles(self) -> tuple[bool, frozenset[int]]:
+        """Identifiers that the controller itself sent; not known in the log of a shadow run."""
+        own: set[int] = set()
+        for block in read_blocks(Log(self.path, new_ticks(0))):
+            if block.kind == "frames":
+                own.update(np.unique(block.records["can_id"][block.records["received"] == 0]).tolist())
+        return bool(own), frozenset(own)
+
+    def frames(self) -> Iterator[Played]:
+        """All frames in their order."""
+        return self._of_log() if self._ours else self._of_recording()
+
+    def _of_log(self) -> Iterator[Played]:
+        for block in read_blocks(Log(self.path, new_ticks(0))):
+            if block.kind != "frames":
+                continue
+            raw = block.records["data"].tobytes()
+            for at, (t_ns, can_id, received, size) in enumerate(
+                block.records[["t_ns", "can_id", "received", "size"]].tolist()
+            ):
+                command = not received or can_id in self._own_ids
+                yield Played(t_ns, can_id, raw[at * 64 : at * 64 + size], size > 8, command)
+
+    def _of_recording(self) -> Iterator[Played]:
+        try:
+            with can.LogReader(self.path) as reader:
+                for m in reader:
+                    if not (m.is_error_frame or m.is_remote_frame):
+                        can_id = m.arbitration_id | (EXTENDED if m.is_extended_id else 0)
+                        t_ns = round(m.timestamp * 1e9)
+                        yield Played(t_ns, can_id, bytes(m.data), m.is_fd, not m.is_rx)
+        except (ValueError, OSError, NotImplementedError, ArithmeticError) as error:
+            raise LogError(f"{self.path}: can't be read as a recording: {error}") from error
+
+
+def play(
+    rounds: Iterable[Iterable[Played]],
+    send: Send,
+    clock: Sleeper,
+    *,
+    rate: float = 1.0,
+    before: Callable[[Played], bool] = lambda frame: False,
+) -> Result:
+    """Send the frames of each round at their distances, divided by ``rate``; a late one goes at once.
+
+    ``before`` is called ahead of each frame and returns True when it held the frame up: time goes on from
+    there. Ctrl-C ends at once and the result so far is returned.
+    """
+    result = Result()
+    try:
+        for frames in rounds:
+            _one_round(frames, send, clock, rate, before, result)
+    except KeyboardInterrupt:
+        result.interrupted = True
+    return result
+
+
+def _one_round(
+    frames: Iterable[Played],
+    send: Send,
+    clock: Sleeper,
+    rate: float,
+    before: Callable[[Played], bool],
+    result: Result,
+) -> None:
+    start_ns, first_ns = clock.now_ns() + LEAD_NS, None
+    for frame in frames:
+        first_ns = frame.t_ns if first_ns is None else first_ns
+        deadline_ns = start_ns + round((frame.t_ns - first_ns) / rate)
+        if before(frame):
+            start_ns += clock.now_ns() - deadline_ns
+            deadline_ns = clock.now_ns()
+        clock.sleep_until(deadline_ns)
+        send(frame.can_id, frame.data, frame.fd)
+        result.add(clock.now_ns() - deadline_ns)
+
+
+def chosen(source: Source, choice: Choice) -> Iterator[Played]:
+    """The frames of a source that a choice takes."""
+    frames = source.frames()
+    head = next(frames, None)
+    if head is None:
+        raise LogError(f"{source.path}: holds no frames")
+    for frame in itertools.chain([head], frames):
+        if (frame.t_ns - head.t_ns) * 1e-9 > choice.to_s:
+            return
+        if choice.takes(frame, head.t_ns):
+            yield frame

@@ -1,0 +1,207 @@
+"""Frames back on a bus: which, when, how late, who may; and what python-can hears and plays itself."""
+
+from __future__ import annotations
+
+import os
+import pty
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from hil.cli import main
+from hil.clock import FakeClock
+from hil.commands.play import Keys
+from hil.convert.export import export
+from hil.log.errors import LogError
+from hil.log.schema import FRAME, Records
+from hil.play import LEAD_NS, Choice, Played, Source, chosen, play
+from tests.logfiles import some_ticks, write_log
+
+IDS = ((0x080, 0, 1), (0x181, 1, 8), (0x201, 0, 8))
+PERIOD_NS = 1_000_000
+
+
+def bus_frames(count: int) -> Records:
+    """SYNC, FEEDBACK, COMMAND of so many ticks, 0.1 ms apart."""
+    frames = np.zeros(count * 3, FRAME)
+    for at, (can_id, received, size) in enumerate(IDS):
+        own = frames[at::3]
+        own["can_id"], own["received"], own["size"] = can_id, received, size
+        own["t_ns"] = np.arange(count) * PERIOD_NS + at * 100_000
+        own["data"][:, 0] = np.arange(count)
+    return frames
+
+
+FRAMES = bus_frames(100)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    write_log(tmp_path / "run.mcap", some_ticks(100), FRAMES, block=25)
+    return tmp_path / "run.mcap"
+
+
+class Bus:
+    """Keeps what is sent and when."""
+
+    def __init__(self, clock: FakeClock) -> None:
+        self.clock, self.sent = clock, []  # type: ignore[var-annotated]
+
+    def __call__(self, can_id: int, data: bytes, fd: bool) -> None:
+        self.sent.append((self.clock.now_ns(), can_id, data, fd))
+
+
+def played(path: Path, choice: Choice, rate: float = 1.0, loops: int = 1, late: Any = ()) -> tuple[Bus, Any]:
+    clock = FakeClock(late)
+    bus, source = Bus(clock), Source(path)
+    return bus, play((chosen(source, choice) for _ in range(loops)), bus, clock, rate=rate)
+
+
+def test_by_default_only_what_the_drive_sent_at_its_distances(path: Path) -> None:
+    bus, result = played(path, Choice())
+    assert {can_id for _, can_id, _, _ in bus.sent} == {0x181} and result.sent == 100
+    assert np.array_equal(np.diff([t for t, *_ in bus.sent]), np.full(99, PERIOD_NS))
+    assert bus.sent[0][0] == LEAD_NS and [d[0] for _, _, d, _ in bus.sent] == list(range(100))
+
+
+def test_rate_loop_window_direction_and_identifiers(path: Path) -> None:
+    bus, _ = played(path, Choice("both", frozenset(), frozenset({0x080}), 0.010, 0.0199), rate=4.0, loops=2)
+    assert [can_id for _, can_id, _, _ in bus.sent] == [0x181, 0x201] * 20
+    assert [d[0] for _, _, d, _ in bus.sent[:20:2]] == list(range(10, 20))
+    assert set(np.diff([t for t, *_ in bus.sent[:20]]).tolist()) == {25_000, 225_000}
+    bus, _ = played(path, Choice("tx", frozenset({0x201})))
+    assert {can_id for _, can_id, _, _ in bus.sent} == {0x201} and len(bus.sent) == 100
+
+
+def test_lateness_is_counted_and_does_not_move_later_deadlines(path: Path) -> None:
+    bus, result = played(path, Choice(), late=[0] * 50 + [5_000_000])
+    assert result.late == 4 and result.max_us == 5000.0  # 5, 4, 3, 2 ms
+    assert result.quantile_us(0.5) == 1.0 and result.quantile_us(0.97) == 2001.0
+    assert bus.sent[-1][0] == LEAD_NS + 99 * PERIOD_NS
+
+
+def test_ctrl_c_ends_at_once_with_what_was_played(path: Path) -> None:
+    clock, sent = FakeClock(), []  # type: ignore[var-annotated]
+
+    def send(*frame: Any) -> None:
+        if len(sent) == 7:
+            raise KeyboardInterrupt
+        sent.append(frame)
+
+    result = play([chosen(Source(path), Choice())], send, clock)
+    assert result.interrupted and result.sent == 7
+
+
+def test_a_command_is_known_by_its_identifier_whoever_sent_it(tmp_path: Path) -> None:
+    frames = FRAMES.copy()
+    frames["received"][5] = 1  # a COMMAND of somebody else
+    write_log(tmp_path / "run.mcap", some_ticks(100), frames)
+    source = Source(tmp_path / "run.mcap")
+    assert source.roles_known and all(f.command == (f.can_id != 0x181) for f in source.frames())
+
+
+def test_roles_are_not_known_in_shadow_logs_and_recordings(path: Path, tmp_path: Path) -> None:
+    frames = FRAMES.copy()
+    frames["received"] = 1
+    write_log(tmp_path / "shadow.mcap", some_ticks(100), frames)
+    export(path, tmp_path / "a.log")
+    assert not Source(tmp_path / "shadow.mcap").roles_known and not Source(tmp_path / "a.log").roles_known
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        ["--direction", "both"],
+        ["--direction", "tx"],
+        ["--direction", "both", "--yes"],
+        ["--direction", "both", "--transmit-commands"],
+    ],
+)
+def test_commands_are_refused_on_a_bus_that_may_be_real(path: Path, capsys: Any, more: list[str]) -> None:
+    assert main(["play", str(path), "-c", "can99", *more]) == 2
+    assert "--transmit-commands" in capsys.readouterr().err
+
+
+def test_a_recording_is_refused_on_a_bus_that_may_be_real(path: Path, tmp_path: Path, capsys: Any) -> None:
+    export(path, tmp_path / "a.log")
+    assert main(["play", str(tmp_path / "a.log"), "-c", "can99"]) == 2
+    assert "--transmit-commands" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [[], ["--direction", "both", "--transmit-commands", "--yes"]])
+def test_what_is_allowed_gets_as_far_as_the_interface(path: Path, capsys: Any, more: list[str]) -> None:
+    assert main(["play", str(path), "-c", "can99", *more]) == 2
+    assert "can't open bus socketcan:can99" in capsys.readouterr().err
+
+
+def heard(bus: can.BusABC, count: int) -> list[tuple[int, bytes]]:
+    messages = [bus.recv(10.0) for _ in range(count)]
+    return [(m.arbitration_id, bytes(m.data)) for m in messages if m is not None]
+
+
+WANTED = [(int(f["can_id"]), bytes(f["data"][: f["size"]])) for f in FRAMES]
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".log", ".asc", ".blf"])
+def test_python_can_hears_every_frame_of_a_log_and_of_its_exports(
+    path: Path, channel: str, ending: str, capsys: Any
+) -> None:
+    source = path.with_suffix(ending)
+    if ending != ".mcap":
+        export(path, source)
+    with can.Bus(interface="hil-local", channel=channel) as bus:
+        flags = ["-i", "hil-local", "-c", channel, "--direction", "both", "--rate", "5", "--json"]
+        assert main(["play", str(source), *flags]) == 0
+        assert heard(bus, len(WANTED)) == WANTED
+    assert '"frames sent": 300' in capsys.readouterr().out
+
+
+def test_can_player_plays_an_exported_log(path: Path, channel: str, monkeypatch: Any) -> None:
+    from can import player
+
+    export(path, path.with_suffix(".log"))
+    with can.Bus(interface="hil-local", channel=channel) as bus:
+        argv = ["can_player", "-i", "hil-local", "-c", channel, "-g", "0.0001", "-v"]
+        monkeypatch.setattr("sys.argv", [*argv, str(path.with_suffix(".log"))])
+        player.main()
+        assert heard(bus, len(WANTED)) == WANTED
+
+
+def test_what_holds_nothing_to_play_is_said(path: Path, tmp_path: Path, capsys: Any, channel: str) -> None:
+    flags = ["-i", "hil-local", "-c", channel]
+    assert main(["play", str(path), *flags, "--id", "0x7ff"]) == 2
+    assert "no frame was chosen" in capsys.readouterr().err
+    (tmp_path / "odd.xyz").write_text("?")
+    for name in ("odd.xyz", "none.log"):
+        assert main(["play", str(tmp_path / name), *flags]) == 2
+    (tmp_path / "bad.blf").write_bytes(b"LOGG" + bytes(range(200)))
+    (tmp_path / "bad.log").write_text("(1.0) can0 not a frame\n")
+    for name in ("bad.blf", "bad.log"):
+        with pytest.raises(LogError):
+            list(chosen(Source(tmp_path / name), Choice()))
+
+
+def test_keys_pause_step_and_go_on() -> None:
+    ours, theirs = pty.openpty()
+    try:
+        import tty
+
+        tty.setcbreak(theirs)
+        keys, frame = Keys(theirs, paused=True), Played(0, 1, b"", False, False)
+        os.write(ours, b"nn ")
+        assert [keys(frame), keys(frame), keys.paused] == [True, True, True]
+        assert keys(frame) and not keys.paused  # the space
+        assert not keys(frame)
+        os.write(ours, b" n")
+        assert keys(frame) and keys.paused
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
+def test_starting_paused_needs_a_terminal(path: Path, channel: str, capsys: Any) -> None:
+    assert main(["play", str(path), "-i", "hil-local", "-c", channel, "--paused"]) == 2
+    assert "needs a terminal" in capsys.readouterr().err
