@@ -108,7 +108,8 @@ class Node:
 
     def _on_command(self) -> None:
         """Before a valid command is taken; a cyclic drive's plant stands still until its first."""
-        self._started = self._started or self._pacing == "cyclic"
+        if not self._started and self._pacing == "cyclic":
+            self._started, self._last_ns = True, time.monotonic_ns()
         self._catch_up()
 
     def _advance_to(self, now_ns: int) -> None:

@@ -23,6 +23,8 @@ from hil.emulate import make_node
 OUT = Path(os.environ["OUT"])
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
+# one processor serves every process of the machine: something stalls all of them for up to 30 ms now and then
+PATIENT = ("guardian.timeout_ms=200.0", "loop.max_gap_ticks=64")
 
 
 def sh(*command: str) -> str:
@@ -84,24 +86,39 @@ class Scenario:
     """Emulator on one interface, controller on another (or the same), candump watching."""
 
     def __init__(
-        self, name: str, drive: str = "vcan0", controller: str = "vcan0", seconds: float = 2.0
+        self,
+        name: str,
+        drive: str = "vcan0",
+        controller: str = "vcan0",
+        seconds: float = 2.0,
+        config: str = CONFIG,
+        plant: tuple[str, ...] = (),
+        settings: tuple[str, ...] = (),
     ) -> None:
         self.name, self.drive, self.controller, self.seconds = name, drive, controller, seconds
+        self.config, self.plant, self.settings = config, plant, settings
+        self.run: Forked | None = None
         self.folder = SCRATCH / name
         self.folder.mkdir()
         self.dump = self.folder / "candump.log"
 
     def __enter__(self) -> Scenario:
         self._candump = subprocess.Popen(["candump", "-L", self.controller], stdout=self.dump.open("w"))
-        self.emulator = Forked(self.folder / "emulator.txt", "emulate", CONFIG, "-c", self.drive)
+        plant = [word for one in self.plant for word in ("--plant-set", one)]
+        words = ("emulate", self.config, *self._bus(self.drive), *plant)
+        self.emulator = Forked(self.folder / "emulator.txt", *words)
         while "ready" not in self.emulator.said() and self.emulator.poll() is None:
             time.sleep(0.01)
         return self
 
+    def _bus(self, channel: str) -> list[str]:
+        own = [word for one in (*PATIENT, *self.settings) for word in ("--set", one)]
+        return ["-i", "socketcan", "-c", channel, *own]
+
     def start(self) -> None:
         folder = ["--set", f'log.folder="{self.folder}"', "--set", f"loop.duration_s={self.seconds}"]
         arm = [] if self.controller.startswith("vcan") else ["--arm", "--yes"]
-        words = ("run", CONFIG, "-c", self.controller, "--json", *arm, *folder)
+        words = ("run", self.config, *self._bus(self.controller), "--json", *arm, *folder)
         self.run = Forked(self.folder / "run.json", *words)
 
     def running(self) -> None:
@@ -110,12 +127,12 @@ class Scenario:
             time.sleep(0.01)
 
     def __exit__(self, *_: object) -> None:
-        code = self.run.wait()
+        code = self.run.wait() if self.run else 0
         self.emulator.send_signal(signal.SIGTERM)
         self.emulator.wait()
         self._candump.terminate()
         self._candump.wait()
-        said = json.loads(self.run.said() or "{}")
+        said = json.loads((self.run.said() if self.run else "") or "{}")
         result = {"returncode": code, "run": said, "emulator": self.emulator.said()}
         (self.folder / "result.json").write_text(json.dumps(result))
         shutil.copytree(self.folder, OUT / self.name)
@@ -194,10 +211,59 @@ def no_partner_fills_the_queue() -> None:
         sh("ip", "link", "set", "can1", "up")
 
 
+FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
+
+
+def vcan_fd() -> None:
+    """One 64-byte frame each way."""
+    with Scenario("vcan_fd", settings=FD, plant=('dbc="../drives/hil_pmsm_fd.dbc"',)) as s:
+        s.start()
+
+
+def vcan_other_drive() -> None:
+    """Big endian, extended identifiers, CAN FD, no SYNC: by configuration alone."""
+    with Scenario("vcan_other_drive", config="configs/inverter.toml") as s:
+        s.start()
+
+
+def controller_is_killed() -> None:
+    """With the drive's watchdog off: what stops it is the guardian."""
+    with Scenario("controller_is_killed", seconds=30.0, plant=("firmware.watchdog_ms=0.0",)) as s:
+        s.start()
+        s.running()
+        s.run.send_signal(signal.SIGKILL)
+        s.run.wait()
+        time.sleep(0.3)
+
+
+BY_HAND = (
+    "080#01", "201#8001060000000000",  # shutdown
+    "080#02", "201#6102070000000000",  # switch on
+    "080#03", "201#94030F0000000000",  # enable operation
+    "080#04", "201#44040F00A00F0000",  # u_q = 40 V
+    "080#05", "080#06",
+)  # fmt: skip
+
+
+def by_hand() -> None:
+    """The emulated drive driven with cansend alone, then left to its watchdog."""
+    with Scenario("by_hand", plant=("firmware.watchdog_ms=1000.0",)):
+        for frame in BY_HAND:
+            sh("cansend", "vcan0", frame)
+            time.sleep(0.01)
+        time.sleep(1.5)
+        sh("cansend", "vcan0", "080#07")
+        time.sleep(0.05)
+
+
 def main() -> int:
     scenarios: list[Callable[[], None]] = [
         vcan_two_processes,
         kvaser_pair,
+        vcan_fd,
+        vcan_other_drive,
+        by_hand,
+        controller_is_killed,
         interface_goes_down_and_up,
         drive_dies,
         second_master,
