@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -108,7 +109,8 @@ def figures(look: Look, ticks: TickArray) -> dict[str, Any]:
 def outcome(log: str) -> str:
     """How a run ended, by its log."""
     try:
-        found = info(Path(log))
-    except (LogError, OSError) as error:
+        found = json.loads(info(Path(log)).metadata.get("result", {}).get("result", "{}"))
+    except (LogError, OSError, ValueError) as error:
         return f"its log can't be read: {error}"
-    return found.metadata.get("result", {}).get("ended") or "its log has no result"
+    ended = found.get("ended") if isinstance(found, dict) else None
+    return str(ended or "its log has no result")

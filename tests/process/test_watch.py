@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,8 +18,8 @@ from hil.demo import emulator_process
 from hil.log.reader import open_log
 from hil.signals import DriveState
 from hil.watch.look import Look, outcome
-from hil.watch.registry import choose
-from tests.process.test_run import call, flags, hil, only_log, voltages_after_stop, wait_for_log
+from hil.watch.registry import WatchError, choose
+from tests.process.test_run import call, flags, hil, only_log, voltages_after_stop
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
@@ -26,6 +28,21 @@ Settings = Callable[..., tuple[str, ...]]
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def wait_for_run(process: subprocess.Popen[str], channel: str) -> None:
+    """Wait until the run has ticked for a while; the first one in a fresh tree compiles before that."""
+    for _ in range(2400):
+        if process.poll() is not None:
+            raise AssertionError(f"the run ended before it began: {process.communicate()}")
+        with contextlib.suppress(WatchError):
+            look = Look(choose(channel))
+            k = look.latest(1)["k"]
+            look.close()
+            if len(k) and k[0] > 300:
+                return
+        time.sleep(0.05)
+    raise AssertionError("the run does not begin")
 
 
 def opened_by(pid: int) -> set[str]:
@@ -38,7 +55,7 @@ def test_a_run_is_seen_stopped_and_says_who_stopped_it(
     own = settings("loop.duration_s=60.0")
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
-        wait_for_log(tmp_path)
+        wait_for_run(process, channel)
         before = opened_by(process.pid)
         seen = call("watch", channel, "--json")
         assert seen.returncode == 0, seen.stderr
@@ -63,7 +80,7 @@ def test_a_run_is_seen_stopped_and_says_who_stopped_it(
     assert outcome(str(log.path)) == "stop_requested"
     assert (voltages_after_stop(log.path) == 0).all()
     assert log.ticks["state"][-1] == DriveState.SWITCH_ON_DISABLED
-    assert [event.text for event in log.events if event.kind == "stop-asked"] == ["a test"]
+    assert [event["text"] for event in log.events if event["kind"] == "stop-asked"] == ["a test"]
     gone = call("watch", channel)
     assert gone.returncode == 2 and "no run with" in gone.stderr
 
