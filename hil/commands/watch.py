@@ -6,6 +6,8 @@ import argparse
 
 from hil.commands.common import Commands, print_json, say
 
+WEB_PORT = 8080
+
 
 def register(commands: Commands) -> None:
     """Add what this module offers."""
@@ -14,6 +16,10 @@ def register(commands: Commands) -> None:
         "run_name", nargs="?", metavar="RUN", help="PID, channel or log; needed with several runs"
     )
     command.add_argument("--once", action="store_true", help="print one frame and leave")
+    command.add_argument(
+        "--web", action="store_true", help="a page on 127.0.0.1 with plots and a stop button"
+    )
+    command.add_argument("--port", type=int, metavar="N", help="of --web; default 8080, 0 takes a free one")
 
 
 def cmd_watch(args: argparse.Namespace) -> int:
@@ -22,6 +28,11 @@ def cmd_watch(args: argparse.Namespace) -> int:
     from hil.watch.look import Look, figures
     from hil.watch.registry import choose
 
+    if args.web:
+        from hil.watch import web
+
+        web.run(args.run_name, WEB_PORT if args.port is None else args.port, say)
+        return 0
     look = Look(choose(args.run_name))
     try:
         if args.json:

@@ -1,0 +1,125 @@
+"use strict";
+// Live plots of a run from the WebSocket beside this page. Comes back by itself when the server or run does.
+(() => {
+  const KEPT_S = 30, HEIGHT = 190, RETRY_MS = 500;
+  const PLOTS = [
+    ["speed [rad/s]", [["w", "measured"], ["w_ref", "reference"]]],
+    ["current [A]", [["i_q", "q"], ["i_q_ref", "q asked"], ["i_d", "d"]]],
+    ["voltage [V]", [["u_q", "q"], ["u_d", "d"]]],
+    ["load torque [N m]", [["T_L_hat", "estimate"], ["T_L_true", "true"]]],
+    ["lateness [us]", [["lateness_ns", "lateness"]]],
+  ];
+  const get = id => document.getElementById(id);
+  const colour = name => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
+  const token = document.querySelector("meta[name=hil-token]").content;
+  let kept = {t: []}, plots = [], socket = null, asked = false;
+
+  function build() {
+    plots.forEach(plot => plot.chart.destroy());
+    const axis = {stroke: colour("soft"), grid: {stroke: colour("line"), width: 1}, ticks: {stroke: colour("line")}};
+    const places = PLOTS.map(() => document.createElement("div")); // all there before one is measured
+    places.forEach(place => { place.className = "plot"; });
+    get("plots").replaceChildren(...places);
+    plots = PLOTS.map(([title, curves], n) => {
+      const place = places[n];
+      const series = curves.map(([, label], i) =>
+        ({label, stroke: colour("c" + i), width: 1.4, points: {show: false}}));
+      const chart = new uPlot({title, width: place.clientWidth, height: HEIGHT, series: [{label: "s"}, ...series],
+        scales: {x: {time: false}}, axes: [{...axis}, {...axis, size: 60}], cursor: {sync: {key: "hil"}}},
+        [[], ...curves.map(() => [])], place);
+      return {chart, place, keys: curves.map(([key]) => key)};
+    });
+  }
+
+  function draw() {
+    for (const {chart, keys} of plots) chart.setData([kept.t, ...keys.map(key => kept[key] ?? [])]);
+    document.body.dataset.points = kept.t.length;
+    document.body.dataset.last = kept.t.at(-1) ?? "";
+  }
+
+  function take(curves) {
+    const last = kept.t.at(-1);
+    if (last > curves.t[0]) { // the first data after coming back hold what is here already
+      const from = curves.t.findIndex(t => t > last);
+      if (from < 0) return;
+      for (const key in curves) curves[key] = curves[key].slice(from);
+    }
+    const gap = last !== undefined && curves.t[0] - last > 0.25; // missed data: break the line
+    const end = curves.t.at(-1) - KEPT_S;
+    const drop = Math.max(0, kept.t.findIndex(t => t >= end));
+    for (const key in curves) {
+      const old = (kept[key] ?? []).slice(drop);
+      if (gap) old.push(key === "t" ? (last + curves.t[0]) / 2 : null);
+      kept[key] = old.concat(curves[key]);
+    }
+    draw();
+  }
+
+  const number = (value, digits, unit) => value == null ? "–" : value.toFixed(digits) + " " + unit;
+  function show(now) {
+    get("state").textContent = now.state.replaceAll("_", " ") + (now.reason ? ": " + now.reason.replaceAll("_", " ") : "");
+    get("state").className = now.state === "operation_enabled" ? "good" : now.state.startsWith("fault") ? "bad" : "warn";
+    const late = now.lateness_us ?? {};
+    const rows = {tick: now.k, speed: number(now.w, 2, "rad/s"), reference: number(now.w_ref, 2, "rad/s"),
+      "load estimate": number(now.T_L_hat, 2, "N m"), "DC link": number(now.v_dc, 0, "V"),
+      rate: number(now.rate_hz, 0, "Hz"), "late p50 / p99 / max": `${late.p50} / ${late.p99} / ${late.max} us`,
+      "skipped (1 s)": now.skipped, dropped: now.dropped};
+    get("figures").replaceChildren(...Object.entries(rows).map(([name, value]) => {
+      const box = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
+      dt.textContent = name; dd.textContent = value; box.append(dt, dd);
+      return box;
+    }));
+  }
+
+  function list(events) {
+    get("events").replaceChildren(...events.reverse().map(cells => {
+      const row = document.createElement("tr");
+      for (const cell of cells) row.insertCell().textContent = cell;
+      return row;
+    }));
+  }
+
+  function on(message) {
+    if (message.run) {
+      kept = {t: []}; asked = false;
+      get("run").textContent = `PID ${message.run.pid} on ${message.run.bus}, log ${message.run.log}`;
+      get("note").textContent = "";
+      get("stop").disabled = false;
+      draw();
+    }
+    if (message.status) idle(message.status);
+    if (message.note) get("note").textContent = message.note;
+    if (message.curves) { show(message.now); list(message.events); take(message.curves); }
+  }
+
+  function idle(text) {
+    get("state").textContent = text;
+    get("state").className = "";
+    get("stop").disabled = true;
+  }
+
+  function connect() {
+    socket = new WebSocket(`ws://${location.host}/live`);
+    socket.onmessage = event => on(JSON.parse(event.data));
+    socket.onclose = () => { idle("no connection; trying again"); setTimeout(again, RETRY_MS); };
+  }
+
+  // A server that was started again has another token: ask for the page first, quietly, then load it anew.
+  async function again() {
+    try {
+      const page = await (await fetch("/")).text();
+      if (!page.includes(`content="${token}"`)) location.reload(); else connect();
+    } catch { setTimeout(again, RETRY_MS); }
+  }
+
+  get("stop").onclick = () => {
+    if (asked || socket.readyState !== WebSocket.OPEN) return;
+    asked = true;
+    get("stop").disabled = true;
+    socket.send(JSON.stringify({stop: token}));
+  };
+  addEventListener("resize", () => plots.forEach(({chart, place}) => chart.setSize({width: place.clientWidth, height: HEIGHT})));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); draw(); });
+  build();
+  connect();
+})();
