@@ -17,7 +17,7 @@ import can
 from drivers.errors import LinkDown, LinkError, QueueFull
 from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, check_length, pack_frame
 
-_DOWN = {errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF}
+_DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO, errno.EBADF}
 _FULL = {errno.ENOBUFS, errno.EAGAIN}
 _FLAGS = EFF_FLAG | RTR_FLAG | ERR_FLAG
 DISCARD_MOST = 100_000

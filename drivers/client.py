@@ -34,6 +34,8 @@ from drivers.mapping import MEASURED, DriveMap, house_map
 from drivers.record import Cell, TranslatedCell, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
 
+BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
+RESTARTED: Final = 0x100
 STOP_REPEATS: Final = 5
 STOP_PAUSE_S: Final = 0.002
 DRAIN_MOST: Final = 256
@@ -282,7 +284,13 @@ class DriveClient:
         handler = self._handlers.get(can_id | frame_flags)
         if handler is not None:
             return handler(data)
-        return ERROR_FRAME if frame_flags & ERR_FLAG else 0
+        return self._on_error(can_id) if frame_flags & ERR_FLAG else 0
+
+    def _on_error(self, error_class: int) -> int:
+        """A controller that went off the bus, or came back to it, is down for good: nothing more is sent."""
+        if error_class & (BUS_OFF | RESTARTED):
+            self._down = True
+        return ERROR_FRAME
 
     def _on_emergency(self, data: bytes) -> int:
         """CiA 301: error code first; code 0 says that an error is gone."""

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
+from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.load import coupler_torque_max
 from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State
 
@@ -132,6 +133,11 @@ def included(value: Any, info: ValidationInfo) -> Any:
     return info.context["include"](value) if isinstance(value, str) and info.context else value
 
 
+def _as_step(fault: ExtraLoad) -> StepLoad:
+    until_s = None if fault.for_s is None else fault.at_s + fault.for_s
+    return StepLoad(kind="step", torque_n_m=fault.torque_n_m, at_s=fault.at_s, until_s=until_s)
+
+
 class PlantConfig(Table):
     """The whole emulated drive."""
 
@@ -148,6 +154,20 @@ class PlantConfig(Table):
     firmware: Firmware = Firmware()
     disturbance: Disturbance = Disturbance()
     load: Annotated[list[Load], Field(max_length=MAX_LOADS)] = []
+    fault: list[Fault] = []
+    black_box: bool = False
+
+    @property
+    def all_loads(self) -> list[Any]:
+        """The plant's loads and those that its faults add."""
+        extra = [fault for fault in self.fault if isinstance(fault, ExtraLoad)]
+        return [*self.load, *(_as_step(fault) for fault in extra)]
+
+    @model_validator(mode="after")
+    def _room_for_loads(self) -> PlantConfig:
+        if len(self.all_loads) > MAX_LOADS:
+            raise ValueError(f"more than {MAX_LOADS} loads with those of the faults")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,9 +233,9 @@ def build_params(config: PlantConfig, wire: Wire) -> Record:
     }
     for name, value in values.items():
         p[name] = value
-    for j, load in enumerate(config.load):
+    for j, load in enumerate(config.all_loads):
         p["load_kind"][0, j], p["load_a"][0, j], p["load_b"][0, j], p["load_c"][0, j] = _load_row(load)
-    p["loads"] = len(config.load)
+    p["loads"] = len(config.all_loads)
     p["varying"] = int((p["load_kind"] > LoadKind.STEP).any())
     return p
 

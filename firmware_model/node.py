@@ -8,7 +8,10 @@ ignored.
 
 from __future__ import annotations
 
+import functools
+import json
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -17,14 +20,17 @@ from drivers.codec import Database
 from drivers.errors import LinkError
 from firmware_model.config import Record, Wire, new_sample, new_state
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
+from firmware_model.faulty_plant import PlantFaults
 from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.plant import State
 
 Frames = HouseFrames | InverterFrames
 
+BLACK_BOX = "black box: "
 HEARTBEAT_NS = 100_000_000
 IDLE_NS = 5_000_000
+RUN_OUT_NS = 500_000_000
 Protocol = Literal["house", "inverter"]
 
 
@@ -52,15 +58,26 @@ class Node:
         period_ns: int,
         truth: bool,
         protocol: Protocol = "house",
+        faults: PlantFaults | None = None,
     ) -> None:
         self._link, self._clock, self._pacing, self._period_ns = link, clock, pacing, period_ns
-        self._frames = frames_of(database, protocol, truth)
+        self._make_frames = functools.partial(frames_of, database, protocol, truth)
+        self._frames, self._faults = self._make_frames(), faults
         self._params = params
         self._state = new_state(params, self._frames.counter_modulus - 1)
         self._sample = new_sample()
         self._last_ns = 0
         self._started = False
-        self.ignored = self._frames.ignored
+
+    @property
+    def ignored(self) -> Counter[str]:
+        """Frames that were not whole, valid and fresh, counted by what was wrong."""
+        return self._frames.ignored
+
+    @property
+    def now_ns(self) -> int:
+        """Plant time."""
+        return int(self.state["t_ns"])
 
     @property
     def state(self) -> Any:
@@ -89,6 +106,14 @@ class Node:
                 self.sync(now)
             wake = min(next_beat, next_cycle) if self._pacing == "cyclic" else next_beat
             self._serve(min(max(wake - now, 0), IDLE_NS))
+        self._run_out()
+
+    def _run_out(self) -> None:
+        """Lockstep with faults: a drive that is left alone meets its watchdog, as it would in real time."""
+        if self._faults is not None:
+            self._faults.box.closed = True  # a load may go on pushing a drive that is off
+            for _ in range(RUN_OUT_NS // self._period_ns):
+                self.pass_time()
 
     def _serve(self, timeout_ns: int) -> None:
         try:
@@ -113,8 +138,23 @@ class Node:
         self._catch_up()
 
     def _advance_to(self, now_ns: int) -> None:
-        advance(self._params[0], self.state, now_ns - self._last_ns)
+        self._advance(now_ns - self._last_ns)
         self._last_ns = now_ns
+
+    def _advance(self, dt_ns: int) -> None:
+        """Move the plant on; a drive whose supply came back boots."""
+        if self._faults is None:
+            advance(self._params[0], self.state, dt_ns)
+            return
+        self._faults.advance(self.state, dt_ns)
+        if self._faults.before(self.state):
+            self._frames = self._make_frames()
+            self._send(self._frames.boot())
+
+    def pass_time(self) -> None:
+        """Lockstep: a period has passed although its SYNC was lost."""
+        if self._started and self._clock == "lockstep":
+            self._advance(self._period_ns)
 
     def take(self, frame: Frame) -> None:
         """Handle one frame, whole or not at all."""
@@ -132,10 +172,12 @@ class Node:
             self._started = self._pacing == "sync"
             self._last_ns = now_ns
         elif self._clock == "lockstep":
-            advance(self._params[0], self.state, self._period_ns)
+            self._advance(self._period_ns)
         else:
             self._advance_to(now_ns)
         on_sync(self._params[0], self.state, self._sample[0])
+        if self._faults is not None:
+            self._faults.after(self.state, self._sample[0])
         self._send(self._frames.answer(self._sample[0]))
 
     def _send(self, frames: list[Sent]) -> None:
@@ -147,8 +189,9 @@ class Node:
                 self.ignored["send"] += 1
 
     def summary(self) -> str:
-        """One line: state at the end and what was ignored."""
+        """State at the end and what was ignored; a second line for the black box."""
         state = State(int(self.state["state"])).name
         ignored = ", ".join(f"{count} {name}" for name, count in sorted(self.ignored.items())) or "none"
         error = int(self.state["error"])
-        return f"emulator stopped: state {state}, error 0x{error:04X}, ignored frames: {ignored}"
+        box = f"\n{BLACK_BOX}{json.dumps(self._faults.box.as_dict(self.state))}" if self._faults else ""
+        return f"emulator stopped: state {state}, error 0x{error:04X}, ignored frames: {ignored}{box}"

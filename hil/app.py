@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from drivers.binding import Binding, bind
-from drivers.bus import BusSettings, open_link
+from drivers.bus import BusSettings, Link, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
 from drivers.client import DriveClient, OnFrame, ignore_frame
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
+from drivers.lockstep import LockstepLink
 from drivers.mapping import MEASURED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
 from hil import realtime
@@ -295,7 +296,10 @@ def _client(
 ) -> DriveClient:
     """A drive client on a link of its own, warmed up."""
     load = setup.config.controller.kind == "fac"
-    link = open_link(bus_settings(setup.config))
+    link: Link = open_link(bus_settings(setup.config))
+    if setup.config.loop.clock == "lockstep":
+        sync = setup.database.optional("SYNC")
+        link = LockstepLink(link, sync.send_id if sync else None)
     client = DriveClient(
         link, setup.database, load=load, drive_map=setup.binding.map, on_frame=on_frame, now=now
     )

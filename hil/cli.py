@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from hil.commands import bench, convert, demo, emulated, log, paper, play, replay, report, run, watch
+from hil.commands import bench, convert, demo, emulated, faults, log, paper, play, replay, report, run, watch
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -23,9 +23,10 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil export LOG -o FILE       ticks as Parquet, CSV, MAT, MF4; frames as candump, ASC, BLF
   hil play LOG -c vcan0        recorded frames back on a bus with their timing
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
+  hil faults [CONFIG]          every fault against the running loop, with a verdict on each
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench)
+MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench, faults)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -202,6 +202,8 @@ class LimitsTable(Table):
     power_window_s: Positive = 1.0
     energy_max_j: Positive | None = None
     applied_deviation_max_v: Positive | None = None
+    following_error_rad_s: Positive | None = None
+    following_error_s: Positive = 0.1
     trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
     guard_trip_ticks: Annotated[int, Field(ge=1)] = 200
     soft_start_s: NonNegative = 0.0
@@ -221,6 +223,8 @@ class FeedbackTable(Table):
     hold_ticks: Annotated[int, Field(ge=0, le=1000)] = 3
     quick_stop_ticks: Annotated[int, Field(ge=1, le=10_000)] = 20
     error_budget: Annotated[int, Field(ge=1, le=10_000)] = 8
+    frozen_ticks: Annotated[int, Field(ge=1, le=10_000)] = 5
+    repeat_ticks: Annotated[int, Field(ge=2, le=10_000)] | None = None
     enable_timeout_s: Positive = 2.0
 
 

@@ -16,7 +16,9 @@ from hil.guard import SAFETY_PARAMS
 from hil.kernel import new_safety_state, prepare, step
 from hil.signals import TickArray, new_ticks
 
-SHADOW_WAITS = 2**62
+CYCLIC_ECHO_LAG = 3
+"""Commands by which the echo of a drive that sends by its own clock may be behind."""
+NEVER = SHADOW_WAITS = 2**62
 """Ticks for which a shadow run waits until somebody else enables the drive: for ever."""
 
 Record = npt.NDArray[np.void]
@@ -143,6 +145,11 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
         "enable_ticks": SHADOW_WAITS if config.loop.shadow else round(feedback.enable_timeout_s * rate),
         "shadow": config.loop.shadow,
         "max_gap": config.loop.max_gap_ticks,
+        "echo_lag": 0 if config.loop.pacing == "sync" else CYCLIC_ECHO_LAG,
+        "frozen_ticks": feedback.frozen_ticks,
+        "w_error_ticks": max(1, round(limits.following_error_s * rate)),
+        "repeat_ticks": feedback.repeat_ticks or NEVER,
+        "frozen_du": frozen_voltage(config, wire),
         "counter_modulus": wire.counter_modulus,
         "u_lsb": wire.u_lsb,
         "T_L_lsb": wire.T_L_lsb,
@@ -150,9 +157,16 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     }
     for name, value in (values | _optional(limits)).items():
         p[name] = value
-    if config.loop.shadow:  # what is applied is somebody else's command, not ours
-        p["deviation_max"] = math.inf
+    if config.loop.shadow:  # command and reference are somebody else's, not ours
+        p["deviation_max"] = p["w_error_max"] = math.inf
     return p
+
+
+def frozen_voltage(config: RunConfig, wire: WireFacts) -> float:
+    """Change of voltage [V] that moves a current by 20 steps of the wire within a tick: 20 LSB L / T_s."""
+    motor, steps = config.motor, 20.0
+    lsb = max(motor.L_q_h * wire.x_lsb[1], motor.L_d_h * wire.x_lsb[2])
+    return max(steps * lsb * config.loop.rate_hz, 10.0 * wire.u_lsb)
 
 
 def _optional(limits: LimitsTable) -> dict[str, float]:
@@ -165,6 +179,7 @@ def _optional(limits: LimitsTable) -> dict[str, float]:
         "i_continuous": limits.i_continuous_a or limits.i_max_a,
         "i2t_max": or_never(limits.i2t_max_a2s),
         "energy_max": or_never(limits.energy_max_j),
+        "w_error_max": or_never(limits.following_error_rad_s),
         "deviation_max": or_never(limits.applied_deviation_max_v),
     }
 

@@ -8,7 +8,9 @@ from pathlib import Path
 from drivers.bus import Link, open_link
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
-from firmware_model.node import Node, wire_of
+from firmware_model.faulty_link import FaultyLink
+from firmware_model.faulty_plant import PlantFaults
+from firmware_model.node import Node, frames_of, wire_of
 from hil import realtime
 from hil.app import Overrides, bus_settings
 from hil.config import RunConfig, load_toml
@@ -28,9 +30,13 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     plant, folder = load_plant(path, config, plant_settings)
     database = Database(folder / plant.dbc, plant.node_id)
     params = build_params(plant, wire_of(database, plant.protocol))
-    link = open_link(bus_settings(config))
+    link: Link = open_link(bus_settings(config))
+    lockstep = config.loop.clock == "lockstep"
+    faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep) if plant.fault else None
+    modulus = frames_of(database, plant.protocol).counter_modulus
+    watched = plant.fault or plant.black_box
     node = Node(
-        link,
+        faulty or link,
         database,
         params,
         clock=config.loop.clock,
@@ -38,11 +44,14 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         period_ns=config.loop.period_ns,
         truth=plant.truth,
         protocol=plant.protocol,
+        faults=PlantFaults(plant.fault, params, modulus - 1) if watched else None,
     )
+    if faulty is not None:
+        faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
     bus = config.bus
     motor = plant.motor.name or "inline"
     what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {motor}, {config.loop.clock}"
-    return node, link, what
+    return node, faulty or link, what
 
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:

@@ -39,6 +39,12 @@ SAFETY_PARAMS: Final = np.dtype(
         ("error_budget", "i8"),
         ("enable_ticks", "i8"),
         ("max_gap", "i8"),
+        ("echo_lag", "i8"),
+        ("frozen_ticks", "i8"),
+        ("repeat_ticks", "i8"),
+        ("frozen_du", "f8"),
+        ("w_error_max", "f8"),
+        ("w_error_ticks", "i8"),
         ("counter_modulus", "i8"),
         ("shadow", "i8"),
         ("u_lsb", "f8"),
@@ -63,6 +69,13 @@ SAFETY_STATE: Final = np.dtype(
         ("over", "i8", 8),
         ("clamped", "i8"),
         ("deviating", "i8"),
+        ("lagging", "i8"),
+        ("echo", "i8"),
+        ("frozen", "i8"),
+        ("repeats", "i8"),
+        ("seen", "f8", 3),
+        ("seen_q", "f8"),
+        ("seen_d", "f8"),
         ("i2t", "f8"),
         ("energy", "f8"),
         ("u_q", "f8"),
@@ -85,6 +98,7 @@ OVER_CURRENT: Final = 1
 OVER_TEMPERATURE: Final = 2
 UNDER_VOLTAGE: Final = 3
 OVER_VOLTAGE: Final = 4
+FOLLOWING: Final = 5
 
 
 @jit
@@ -114,6 +128,27 @@ def windows_trip(p: Any, s: Any, t: Any) -> int:
 
 
 @jit
+def is_frozen(p: Any, s: Any, t: Any) -> bool:
+    """True once speed and currents have stood still for ``frozen_ticks`` although the voltage moved.
+
+    The voltage must have moved by ``frozen_du`` since they began to stand still: so much moves the current
+    by many steps of the wire within a tick. A drive that limits the voltage is left out. Where the sensors
+    are known to be noisy, ``repeat_ticks`` equal readings of a turning motor tell it at constant voltage too.
+    """
+    seen = s["seen"]
+    same = t["w"] == seen[0] and t["i_q"] == seen[1] and t["i_d"] == seen[2]
+    if not same or t["limited"]:
+        seen[0], seen[1], seen[2] = t["w"], t["i_q"], t["i_d"]
+        s["seen_q"], s["seen_d"], s["frozen"], s["repeats"] = s["ua_q"], s["ua_d"], 0, 0
+        return False
+    dq, dd = s["ua_q"] - s["seen_q"], s["ua_d"] - s["seen_d"]
+    moved = dq * dq + dd * dd > p["frozen_du"] * p["frozen_du"]
+    s["frozen"] = s["frozen"] + 1 if moved else 0
+    s["repeats"] = s["repeats"] + 1 if t["w"] != 0.0 else 0
+    return bool(s["frozen"] >= p["frozen_ticks"] or s["repeats"] >= p["repeat_ticks"])
+
+
+@jit
 def judge_measurement(p: Any, s: Any, t: Any) -> int:
     """Return the Reason to stop that a fresh measurement gives, 0 for none.
 
@@ -129,6 +164,7 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
     hot = persists(s, OVER_TEMPERATURE, temperature > p["temperature_max"], ticks)
     low = persists(s, UNDER_VOLTAGE, t["v_dc"] < p["v_dc_min"], ticks)
     high = persists(s, OVER_VOLTAGE, t["v_dc"] > p["v_dc_max"], ticks)
+    frozen = is_frozen(p, s, t)
     if speed:
         return Reason.OVER_SPEED.value
     if current:
@@ -139,6 +175,8 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
         return Reason.DC_LINK_UNDER_VOLTAGE.value
     if high:
         return Reason.DC_LINK_OVER_VOLTAGE.value
+    if frozen:
+        return Reason.FROZEN_FEEDBACK.value
     return int(windows_trip(p, s, t))
 
 
@@ -146,6 +184,17 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
 def limit_step(value: float, previous: float, step: float) -> float:
     """Limit the change from ``previous`` to ``step`` per tick."""
     return min(max(value, previous - step), previous + step)
+
+
+@jit
+def step_share(p: Any, s: Any, u_q: float, u_d: float) -> float:
+    """Share of the way from the last voltage to (u_q, u_d) that keeps each axis to du_max per tick.
+
+    Both ends lie in the voltage circle, so what lies between them does; limiting each axis by itself would
+    leave the straight way and reach out of the circle.
+    """
+    most = max(abs(u_q - s["u_q"]), abs(u_d - s["u_d"]))
+    return float(p["du_max"] / most) if most > p["du_max"] else 1.0
 
 
 @jit
@@ -201,8 +250,12 @@ def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) ->
         ratio = limit / norm  # 0 for a norm that overflows
         u_q, u_d = u_q * ratio, u_d * ratio
         flags |= GuardFlag.SOFT_START.value if limit < p["u_max"] else GuardFlag.VOLTAGE.value
-    step_q, step_d = limit_step(u_q, s["u_q"], p["du_max"]), limit_step(u_d, s["u_d"], p["du_max"])
-    flags |= GuardFlag.VOLTAGE_STEP.value if (step_q != u_q or step_d != u_d) else 0
+    share = step_share(p, s, u_q, u_d)
+    step_q, step_d = u_q, u_d
+    if share < 1.0:
+        step_q = limit_step(s["u_q"] + share * (u_q - s["u_q"]), s["u_q"], p["du_max"])
+        step_d = limit_step(s["u_d"] + share * (u_d - s["u_d"]), s["u_d"], p["du_max"])
+        flags |= GuardFlag.VOLTAGE_STEP.value
     load = min(max(T_L, -p["T_L_max"]), p["T_L_max"])
     flags |= GuardFlag.LOAD_TORQUE.value if load != T_L else 0
     flags |= GuardFlag.APPLIED_DEVIATES.value if deviates(p, s, t) else 0

@@ -104,6 +104,9 @@ class Reason(IntEnum):
     ENERGY = 23
     GUARDIAN = 24
     GUARDIAN_LOST = 25
+    COMMAND_LOST = 26
+    FROZEN_FEEDBACK = 27
+    FOLLOWING_ERROR = 28
 
 
 class GuardFlag(IntEnum):

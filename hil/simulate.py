@@ -152,6 +152,8 @@ def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
     if ticks is None:
         raise ConfigError(str(setup.path), ["loop.duration_s: missing; a simulation must end"])
     plant, folder = load_plant(setup.path, setup.config, plant_settings)
+    if plant.fault:
+        raise ConfigError(str(setup.path), ["fault: a fault script needs the bus; use hil run or hil faults"])
     database = Database(folder / plant.dbc, plant.node_id)
     params = build_params(plant, wire_of(database, plant.protocol))
     state = new_state(params, setup.wire.counter_modulus - 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from hil.control.jit import jit
-from hil.guard import judge_measurement
+from hil.guard import FOLLOWING, judge_measurement, persists
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
 
 STOP_TICKS = 20
@@ -74,6 +74,33 @@ def judge_timing(p: Any, s: Any, t: Any) -> int:
 
 
 @jit
+def judge_echo(p: Any, s: Any, t: Any) -> int:
+    """Count fresh ticks in a row whose echo is not the last command's; return the Reason past the hold time.
+
+    Either the drive does not get the commands, or what comes is the answer to an older SYNC: both make
+    feedback that is good frame by frame worthless. An echo that stands still does not count as right when
+    the command's counter comes round to it.
+    """
+    if p["shadow"] or not t["rx_flags"] & RxFlag.FRESH:
+        return Reason.NONE.value
+    lag = (int(s["counter"]) - int(t["echo"])) % int(p["counter_modulus"])
+    right = lag <= p["echo_lag"] and t["echo"] != s["echo"]
+    s["lagging"] = 0 if right else s["lagging"] + 1
+    s["echo"] = t["echo"]
+    return Reason.COMMAND_LOST.value if s["lagging"] > p["hold_ticks"] else Reason.NONE.value
+
+
+@jit
+def judge_following(p: Any, s: Any, t: Any) -> int:
+    """Return the Reason once the speed has been off its reference by more than allowed for too long."""
+    if not t["rx_flags"] & RxFlag.FRESH:
+        return Reason.NONE.value
+    off = abs(t["w_ref"] - t["w"]) > p["w_error_max"]
+    lost = persists(s, FOLLOWING, off, p["w_error_ticks"])
+    return Reason.FOLLOWING_ERROR.value if lost else Reason.NONE.value
+
+
+@jit
 def first(a: int, b: int) -> int:
     """Return the first reason that is one."""
     return a if a != 0 else b
@@ -90,6 +117,8 @@ def judge(p: Any, s: Any, t: Any) -> int:
     reason = first(bus, measured)
     if s["state"] == DriveState.OPERATION_ENABLED:
         reason = first(reason, judge_drive(s, t))
+        reason = first(reason, judge_echo(p, s, t))
+        reason = first(reason, judge_following(p, s, t))
     reason = first(reason, timing)
     reason = first(reason, Reason.LOG_FAILED.value if t["log_failed"] else 0)
     return first(reason, judge_request(t))

@@ -36,7 +36,8 @@ class Bench:
         t = self.t
         t["gap"], t["rx_flags"], t["drive_state"], t["echo"] = gap, flags, self.drive, t["counter"]
         t["v_dc"], t["temperature_motor"], t["temperature_inverter"] = 540.0, 25.0, 25.0
-        t["w"] = t["i_q"] = t["i_d"] = 0.0
+        t["w"] = t["i_q"] = 0.0
+        t["i_d"] = 0.01 * (int(t["k"]) % 2)  # a reading that stands still would be a fault
         t["request"] = int(Request.ARM)
         t["log_failed"] = 0
         for name, value in inputs.items():

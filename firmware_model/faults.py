@@ -1,0 +1,153 @@
+"""Fault scripts of the emulated drive: when, for how long, what. Tables only; what they do is left to
+:mod:`firmware_model.faulty_plant` (the drive itself) and :mod:`firmware_model.faulty_link` (its bus side).
+
+Times are plant time [s] from the first SYNC; ``for_s`` left out means for good. Every random choice is
+drawn from the fault's own ``seed``, so that a script gives the same run each time.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class FaultTable(BaseModel):
+    """What all faults have: a beginning and a length."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    at_s: NonNegative
+    for_s: Positive | None = None
+
+    def active(self, t_ns: int) -> bool:
+        """True while the fault is there; both ends are exact nanoseconds."""
+        begin = round(self.at_s * 1e9)
+        return begin <= t_ns and (self.for_s is None or t_ns < begin + round(self.for_s * 1e9))
+
+
+class FrameFault(FaultTable):
+    """Something happens to a share of the frames of one message, in the direction in which it travels."""
+
+    message: str = "FEEDBACK"
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+
+
+class Drop(FrameFault):
+    """The frame is lost."""
+
+    kind: Literal["drop"]
+
+
+class Delay(FrameFault):
+    """The frame comes later."""
+
+    kind: Literal["delay"]
+    delay_ms: Positive
+
+
+class Duplicate(FrameFault):
+    """The frame comes twice."""
+
+    kind: Literal["duplicate"]
+
+
+class Reorder(FrameFault):
+    """The frame comes after the next one of its message."""
+
+    kind: Literal["reorder"]
+
+
+class Corrupt(FrameFault):
+    """``bits`` different bits of the frame are flipped."""
+
+    kind: Literal["corrupt"]
+    bits: Annotated[int, Field(ge=1, le=32)] = 1
+
+
+class FrozenCounter(FrameFault):
+    """The frame's counter stands still; CRC and values stay good."""
+
+    kind: Literal["frozen-counter"]
+
+
+class BusOff(FaultTable):
+    """The controllers fall off the bus: an error frame says so, then nothing passes in either direction."""
+
+    kind: Literal["bus-off"]
+
+
+class FrozenValue(FaultTable):
+    """Speed and currents stand still in frames whose counter and CRC are good."""
+
+    kind: Literal["frozen-value"]
+
+
+class Noise(FaultTable):
+    """Sensors with this standard deviation instead of their own."""
+
+    kind: Literal["noise"]
+    w_noise_rad_s: NonNegative = 0.0
+    i_noise_a: NonNegative = 0.0
+
+
+class Bias(FaultTable):
+    """Sensors that read too much by this."""
+
+    kind: Literal["bias"]
+    w_rad_s: Finite = 0.0
+    i_q_a: Finite = 0.0
+    i_d_a: Finite = 0.0
+
+
+class EncoderSlip(FaultTable):
+    """The rotor angle that the drive transforms by is off by this electrical angle."""
+
+    kind: Literal["encoder-slip"]
+    angle_deg: Finite
+
+
+class PhaseLoss(FaultTable):
+    """Phase a is open: no current flows in the stator's alpha axis."""
+
+    kind: Literal["phase-loss"]
+
+
+class DcLink(FaultTable):
+    """The DC link stands at another voltage."""
+
+    kind: Literal["dc-link"]
+    v_dc_v: Positive
+
+
+class OverTemperature(FaultTable):
+    """The motor's winding heats up at this rate on top of its losses."""
+
+    kind: Literal["over-temperature"]
+    rate_k_s: Positive
+
+
+class ExtraLoad(FaultTable):
+    """A load torque on top of the plant's loads."""
+
+    kind: Literal["load"]
+    torque_n_m: Finite
+
+
+class BrownOut(FaultTable):
+    """The drive's supply fails: silent, gates off; when it comes back the firmware boots anew."""
+
+    kind: Literal["brown-out"]
+    for_s: Positive
+
+
+LinkFault = Drop | Delay | Duplicate | Reorder | Corrupt | FrozenCounter | BusOff
+PlantFault = (
+    FrozenValue | Noise | Bias | EncoderSlip | PhaseLoss | DcLink | OverTemperature | ExtraLoad | BrownOut
+)
+Fault = Annotated[LinkFault | PlantFault, Field(discriminator="kind")]

@@ -1,0 +1,269 @@
+"""One row of the matrix as real processes: emulated drive, controller, its writer, on a bus of their own.
+
+The processes are forked from one that has imported everything; what they run is what ``hil emulate`` and
+``hil run`` run. Faults of the host are put on the running controller from outside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import socket
+import struct
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.bus import open_link
+from firmware_model.node import BLACK_BOX
+from hil.app import Overrides, Setup, bus_settings, load_setup, run
+from hil.emulate import load_plant, serve
+from hil.errors import ConfigError, HilError
+from hil.faults.judge import Evidence, Result, judge
+from hil.faults.matrix import ClockStep, DiskFull, InterfaceDown, Matrix, Row, Stall, WriterKilled
+from hil.log.reader import open_log
+from hil.replay import replay_log
+from hil.signals import DriveState
+
+RUN_TIMEOUT_S: Final = 60.0
+_CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
+_fork = multiprocessing.get_context("fork")
+
+
+class Forked:
+    """A function as a process; its standard output is a pipe of ours, its standard error a file."""
+
+    def __init__(self, errors: Path, target: Callable[..., None], *args: Any) -> None:
+        self.out, write = os.pipe()
+        self._process: BaseProcess = _fork.Process(target=_redirected, args=(write, errors, target, args))
+        self._process.start()
+        os.close(write)
+        self.pid = self._process.pid or 0
+
+    def line(self) -> str:
+        """Its next line; "" when it has ended."""
+        text = b""
+        while not text.endswith(b"\n") and (byte := os.read(self.out, 1)):
+            text += byte
+        return text.decode().strip()
+
+    def rest(self) -> str:
+        """All that it still says until it ends."""
+        parts = []
+        while part := os.read(self.out, 1 << 16):
+            parts.append(part)
+        os.close(self.out)
+        return b"".join(parts).decode()
+
+    def wait(self, timeout_s: float) -> int | None:
+        """Its exit code, None when it is still there."""
+        self._process.join(timeout_s)
+        return self._process.exitcode
+
+    def end(self, number: int) -> None:
+        """Send it a signal, unless it has ended."""
+        if self._process.is_alive():
+            os.kill(self.pid, number)
+
+
+def _redirected(write: int, errors: Path, target: Callable[..., None], args: tuple[Any, ...]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+    os.dup2(write, 1)
+    with errors.open("wb") as file:
+        os.dup2(file.fileno(), 2)
+    target(*args)
+
+
+def _control(setup: Setup, host: Any) -> None:
+    """The controller's process."""
+    if isinstance(host, ClockStep):
+        _step_wall_clock(host)
+    try:
+        outcome = run(setup).outcome
+    except HilError as error:
+        os.write(2, f"{error}\n".encode())
+        raise SystemExit(2) from error
+    os.write(1, f"{outcome.reason}\n".encode())
+
+
+def _step_wall_clock(fault: ClockStep) -> None:
+    """Let the wall clock of this process jump once; nothing else of the machine sees it."""
+    begin, time_s, time_ns = time.monotonic(), time.time, time.time_ns
+
+    def step_s() -> float:
+        return fault.step_s if time.monotonic() - begin > fault.at_s else 0.0
+
+    setattr(time, "time", lambda: time_s() + step_s())  # noqa: B010 - a module's function, on purpose
+    setattr(time, "time_ns", lambda: time_ns() + round(step_s() * 1e9))  # noqa: B010
+
+
+def own_network() -> None:
+    """Move this process into a network namespace of its own, with loopback up. Raises HilError."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    uid, gid = os.getuid(), os.getgid()
+    if libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET) != 0:
+        raise HilError(f"no network namespace of its own: {os.strerror(ctypes.get_errno())}")
+    with contextlib.suppress(OSError):
+        Path("/proc/self/setgroups").write_text("deny", encoding="ascii")
+        Path("/proc/self/uid_map").write_text(f"0 {uid} 1", encoding="ascii")
+        Path("/proc/self/gid_map").write_text(f"0 {gid} 1", encoding="ascii")
+    set_loopback(True)
+
+
+def set_loopback(up: bool) -> None:
+    """Bring the loopback interface of this network namespace up or down."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        name = struct.pack("16sH14x", b"lo", 0)
+        flags = struct.unpack_from("16sH", fcntl.ioctl(sock, _SIOCGIFFLAGS, name))[1]
+        flags = flags | _IFF_UP if up else flags & ~_IFF_UP
+        fcntl.ioctl(sock, _SIOCSIFFLAGS, struct.pack("16sH14x", b"lo", flags))
+
+
+@contextlib.contextmanager
+def emulator(
+    path: Path, overrides: Overrides, plant_settings: list[str], errors: Path
+) -> Iterator[list[str]]:
+    """The emulated drive; what it said in the end is in the list that is yielded, after the block."""
+    said: list[str] = []
+    process = Forked(errors, serve, path, overrides, plant_settings)
+    try:
+        if not (line := process.line()).startswith("emulator ready"):
+            raise HilError(f"the emulator can't start: {line or errors.read_text(encoding='utf-8').strip()}")
+        yield said
+    finally:
+        process.end(signal.SIGTERM)
+        said += process.rest().splitlines()
+        if process.wait(10.0) is None:
+            process.end(signal.SIGKILL)
+            process.wait(10.0)
+
+
+def black_box(said: list[str]) -> dict[str, Any]:
+    """The drive's own record of what was at the motor."""
+    for line in said:
+        if line.startswith(BLACK_BOX):
+            found: dict[str, Any] = json.loads(line.removeprefix(BLACK_BOX))
+            return found
+    raise HilError("the emulator left no black box")
+
+
+def wait_for_operation(setup: Setup, timeout_s: float = 30.0) -> int:
+    """Listen until the drive says that operation is enabled; monotonic time of that [ns]."""
+    feedback = setup.database.message("FEEDBACK", "State")
+    read = feedback.reader("State")
+    link = open_link(bus_settings(setup.config))
+    end = time.monotonic() + timeout_s
+    try:
+        while time.monotonic() < end:
+            frame = link.receive(100_000_000)
+            if frame is None or frame.can_id != feedback.can_id or len(frame.data) != feedback.length:
+                continue
+            if read(frame.data)[0] == DriveState.OPERATION_ENABLED:
+                return time.monotonic_ns()
+    finally:
+        link.close()
+    raise HilError("the drive was not enabled")
+
+
+def writer_of(pid: int) -> int:
+    """Process id of the writer that the controller ``pid`` started."""
+    for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
+        if b"hil.log.writer" in Path(f"/proc/{child}/cmdline").read_bytes():
+            return int(child)
+    raise HilError("the controller has no writer")
+
+
+def inject(host: Any, controller: Forked, setup: Setup, log: Callable[[], Path]) -> int:
+    """Put a fault on the running controller; its monotonic time [ns]."""
+    at_ns = wait_for_operation(setup) + round(host.at_s * 1e9)
+    time.sleep(max(0.0, (at_ns - time.monotonic_ns()) * 1e-9))
+    onset_ns = time.monotonic_ns()
+    if isinstance(host, Stall):
+        controller.end(signal.SIGSTOP)
+        time.sleep(host.for_ms * 1e-3)
+        controller.end(signal.SIGCONT)
+    elif isinstance(host, WriterKilled):
+        os.kill(writer_of(controller.pid), signal.SIGKILL)
+    elif isinstance(host, DiskFull):
+        size = log().stat().st_size
+        resource.prlimit(writer_of(controller.pid), resource.RLIMIT_FSIZE, (size, size))
+    elif isinstance(host, InterfaceDown):
+        set_loopback(False)
+    return onset_ns
+
+
+def run_row(path: Path, matrix: Matrix, row: Row, folder: Path) -> Result:
+    """Run one row and judge it. Never raises: what went wrong is in the row's ``why``."""
+    result = Result(row.name, row.expect.text, clock="realtime" if row.realtime else "lockstep")
+    try:
+        if isinstance(row.host, InterfaceDown):
+            own_network()
+        _run(path, matrix, row, folder, result)
+    except (HilError, OSError) as error:
+        result.why.append(str(error))
+    return result
+
+
+def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    own = (
+        f"bus.channel={json.dumps('faults-' + uuid.uuid4().hex[:12])}",
+        f"log.folder={json.dumps(str(folder))}",
+    )
+    overrides = Overrides(settings=(*matrix.settings(row), *own, 'log.name="run"'))
+    setup, onset_ns = load_setup(path, overrides), None
+    with emulator(path, overrides, matrix.plant_settings(row), folder / "emulator.txt") as said:
+        controller = Forked(folder / "controller.txt", _control, setup, row.host)
+        try:
+            if row.host is not None:
+                onset_ns = inject(row.host, controller, setup, lambda: folder / "run.mcap")
+            if controller.wait(RUN_TIMEOUT_S) is None:
+                result.why.append(f"the controller did not end in {RUN_TIMEOUT_S:g} s")
+        finally:
+            controller.end(signal.SIGKILL)
+            controller.wait(10.0)
+        ended = controller.rest().strip()
+    if not ended.isdecimal():
+        result.why.append("the controller died: " + (folder / "controller.txt").read_text(encoding="utf-8"))
+    log = open_log(folder / "run.mcap")
+    result.path = str(log.path)
+    onset_s = row.onset_s
+    if onset_ns is not None and len(log.ticks):
+        onset_s = (onset_ns - int(log.ticks["t_ns"][0])) * 1e-9
+    command = setup.database.message("COMMAND", "VoltageQ", "VoltageD")
+    reader = command.reader("VoltageQ", "VoltageD")
+    evidence = Evidence(log, black_box(said), int(ended) if ended.isdecimal() else None, onset_s)
+    judge(result, row.expect, evidence, setup.config.limits.u_max_v, reader, command.can_id)
+    verdict = replay_log(log)
+    result.replay = verdict.verdict
+    if verdict.verdict != "same":
+        result.why.append(f"replay: {verdict.verdict} {verdict.why}".strip())
+
+
+def check_rows(path: Path, matrix: Matrix, rows: list[Row]) -> Setup:
+    """Load every row's configurations; raises ConfigError with all mistakes of all rows."""
+    problems: list[str] = []
+    setup = None
+    for row in rows:
+        try:
+            setup = load_setup(path, Overrides(settings=matrix.settings(row)))
+            plant, _ = load_plant(path, setup.config, matrix.plant_settings(row))
+            for message in {getattr(fault, "message", "FEEDBACK") for fault in plant.fault}:
+                setup.database.message(message)
+        except HilError as error:
+            found = error.problems if isinstance(error, ConfigError) else [str(error)]
+            problems += [f"row {row.name!r}: {problem}" for problem in found]
+    if problems or setup is None:
+        raise ConfigError(str(path), problems)
+    return setup

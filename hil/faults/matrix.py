@@ -1,0 +1,186 @@
+"""The fault matrix as a file: for each row what goes wrong and what must come of it.
+
+What is expected stands in the file and is never computed from a result. Faults of the drive and its bus are
+tables of the emulated drive and are checked with its configuration; faults of the host are tables of this
+module.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from hil.config import NonNegative, Positive, Table, load_toml, read_toml
+from hil.errors import ConfigError
+from hil.signals import Reason
+
+REASONS = frozenset(reason.name.lower() for reason in Reason if reason)
+
+
+class Stall(Table):
+    """The controller is stopped (SIGSTOP) and goes on after ``for_ms``."""
+
+    kind: Literal["stall"]
+    at_s: NonNegative
+    for_ms: Annotated[int, Field(ge=1, le=5000)]
+
+
+class WriterKilled(Table):
+    """The log's writer process is killed (SIGKILL)."""
+
+    kind: Literal["writer-killed"]
+    at_s: NonNegative
+
+
+class DiskFull(Table):
+    """The log can't grow any more: the writer's file size limit is set to what it has."""
+
+    kind: Literal["disk-full"]
+    at_s: NonNegative
+
+
+class ClockStep(Table):
+    """The wall clock that the controller's process reads jumps by ``step_s``."""
+
+    kind: Literal["clock-step"]
+    at_s: NonNegative
+    step_s: float
+
+
+class InterfaceDown(Table):
+    """The interface goes down (in a network namespace of the row's own)."""
+
+    kind: Literal["interface-down"]
+    at_s: NonNegative
+
+
+Host = Annotated[Stall | WriterKilled | DiskFull | ClockStep | InterfaceDown, Field(discriminator="kind")]
+
+
+class Expect(Table):
+    """What must come of a fault. ``reason``: any of these ends the run; ``within_ms``: to the safe state.
+
+    ``w_error_rad_s``: a run that rides through ends with the speed this near to its reference;
+    ``w_max_rad_s`` and ``i_max_a``: the true speed and current from the fault on stay below.
+    """
+
+    reaction: Literal["ride through", "stop"]
+    reason: list[str] = Field(default_factory=list)
+    within_ms: Positive | None = None
+    w_error_rad_s: Positive = 1.0
+    w_max_rad_s: Positive | None = None
+    i_max_a: Positive | None = None
+    log: Literal["complete", "readable"] = "complete"
+
+    @field_validator("reason")
+    @classmethod
+    def _known(cls, value: list[str]) -> list[str]:
+        unknown = [name for name in value if name not in REASONS]
+        if unknown:
+            raise ValueError(
+                f"{', '.join(unknown)}: no reason of a stop; there are {', '.join(sorted(REASONS))}"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _complete(self) -> Expect:
+        if self.reaction == "stop" and not (self.reason and self.within_ms):
+            raise ValueError("a stop needs reason and within_ms")
+        if self.reaction == "ride through" and (self.reason or self.within_ms):
+            raise ValueError("a ride through has no reason and no within_ms")
+        return self
+
+    @property
+    def text(self) -> str:
+        """As the table shows it."""
+        if self.reaction == "ride through":
+            return self.reaction
+        return f"stop: {' or '.join(self.reason)} within {self.within_ms:g} ms"
+
+
+class Row(Table):
+    """One run with its faults; ``set`` and ``plant_set`` override keys of its configurations."""
+
+    name: Annotated[str, Field(min_length=1, max_length=60)]
+    fault: list[dict[str, Any]] = Field(default_factory=list)
+    host: Host | None = None
+    set: list[str] = Field(default_factory=list)
+    plant_set: list[str] = Field(default_factory=list)
+    expect: Expect
+
+    @property
+    def realtime(self) -> bool:
+        """Faults of the host need real time; all others run in lockstep."""
+        return self.host is not None
+
+    @property
+    def onset_s(self) -> float:
+        """When the first fault of the drive begins."""
+        return min((float(fault.get("at_s", 0.0)) for fault in self.fault), default=0.0)
+
+    def plant_settings(self) -> list[str]:
+        """Overrides of the plant for this row."""
+        return [*self.plant_set, "black_box=true", f"fault={inline(self.fault)}"]
+
+
+class Matrix(Table):
+    """All rows, and what they have in common."""
+
+    run: str = "demo.toml"
+    set: list[str] = Field(default_factory=list)
+    host_set: list[str] = Field(default_factory=list)
+    host_plant_set: list[str] = Field(default_factory=list)
+    plant_set: list[str] = Field(default_factory=list)
+    row: Annotated[list[Row], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> Matrix:
+        names = [row.name for row in self.row]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"rows of the same name: {', '.join(twice)}")
+        return self
+
+    def settings(self, row: Row) -> tuple[str, ...]:
+        """Overrides of the run configuration for a row."""
+        host = self.host_set if row.realtime else ['loop.clock="lockstep"']
+        return (*self.set, *host, *row.set)
+
+    def plant_settings(self, row: Row) -> list[str]:
+        """Overrides of the plant for a row."""
+        host = self.host_plant_set if row.realtime else []
+        return [*self.plant_set, *host, *row.plant_settings()]
+
+
+def inline(value: Any) -> str:
+    """A value in TOML's inline syntax."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {inline(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(inline, value)) + "]"
+    if isinstance(value, (bool, str)):
+        return json.dumps(value)
+    return repr(value)
+
+
+def load_matrix(path: Path, shipped: Path) -> tuple[Matrix, Path]:
+    """The matrix that ``path`` names and its run configuration.
+
+    ``path`` may be a matrix, or a run configuration that the shipped matrix is then run with.
+    """
+    if "row" in read_toml(path):
+        matrix = load_toml(path, Matrix)
+        return matrix, path.parent / matrix.run
+    return load_toml(shipped, Matrix), path
+
+
+def chosen(matrix: Matrix, names: list[str]) -> list[Row]:
+    """The rows whose names contain one of ``names``; all without any. Raises ConfigError for none."""
+    rows = [row for row in matrix.row if not names or any(name in row.name for name in names)]
+    if not rows:
+        known = ", ".join(row.name for row in matrix.row)
+        raise ConfigError("--only", [f"{', '.join(names)}: no such row; there are {known}"])
+    return rows
