@@ -78,7 +78,7 @@ class BlackBox:
             self.worst = {name: max(value, now[name]) for name, value in self.worst.items()}
 
     def as_dict(self, s: Any) -> dict[str, Any]:
-        """Worst values from fault to the end of the run, end of the voltage [s], how the drive ended."""
+        """Worst values from the last fault on, end of the voltage [s], how the drive ended."""
         last_on_s = None if self.last_on_ns < 0 else self.last_on_ns * 1e-9
         state, error = State(int(s["state"])).name, ErrorCode(int(s["error"])).name
         return {**self.worst, "voltage_until_s": last_on_s, "state": state, "error": error}
@@ -94,7 +94,7 @@ class PlantFaults:
         self._frozen: dict[int, tuple[float, ...]] = {}
         self._off = False
         self._last_ns = 0
-        onset_s = min((fault.at_s for fault in faults), default=0.0)
+        onset_s = max((fault.at_s for fault in faults), default=0.0)
         self.box = BlackBox(round(onset_s * 1e9))
 
     def advance(self, s: Any, dt_ns: int) -> None:

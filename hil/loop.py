@@ -217,7 +217,6 @@ class Loop:
             self._drive.send(tick)
         except OSError as error:
             t = self._cells
-            t.send[0] = 0
             self._recorder.event(t.t_ns[0], t.k[0], "send-failed", str(error))
 
     def _ended(self) -> bool:

@@ -107,6 +107,7 @@ class Reason(IntEnum):
     COMMAND_LOST = 26
     FROZEN_FEEDBACK = 27
     FOLLOWING_ERROR = 28
+    CURRENT_UNCONTROLLED = 29
 
 
 class GuardFlag(IntEnum):
@@ -182,7 +183,14 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(50, "guard_flags", "u4", "", "output", "GuardFlag bits"),
     Field(51, "controlword", "u4", "", "output", "CiA 402 controlword sent"),
     Field(52, "counter", "u4", "", "output", "counter of the command sent"),
-    Field(53, "send", "u4", "", "output", "1 when a command goes out this tick"),
+    Field(
+        53,
+        "send",
+        "u4",
+        "",
+        "output",
+        "1 when a command goes out this tick; an event says when the bus refused it",
+    ),
     Field(54, "filled", "u4", "", "output", "observer memory filled with measurements, ticks"),
     Field(55, "ua_q", "f8", "V", "output", "q voltage applied over the past period"),
     Field(56, "ua_d", "f8", "V", "output", "d voltage applied over the past period"),

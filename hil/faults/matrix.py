@@ -118,8 +118,8 @@ class Row(Table):
 
     @property
     def onset_s(self) -> float:
-        """When the first fault of the drive begins."""
-        return min((float(fault.get("at_s", 0.0)) for fault in self.fault), default=0.0)
+        """When the last fault of the drive begins; those before it are its set-up."""
+        return max((float(fault.get("at_s", 0.0)) for fault in self.fault), default=0.0)
 
     def plant_settings(self) -> list[str]:
         """Overrides of the plant for this row."""

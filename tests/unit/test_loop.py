@@ -146,11 +146,11 @@ def test_a_sync_that_fails_is_a_bus_that_is_down() -> None:
     assert drive.calls[-1] == "stop"
 
 
-def test_a_command_that_fails_is_logged_and_marked() -> None:
+def test_a_command_that_fails_is_logged() -> None:
     loop, memory, _ = make(ScriptedDrive({"send": 2}), FakeClock(), ticks=4)
     loop.run()
     assert memory.events == ["state", "send-failed", "stop"]
-    assert [int(t["send"][0]) for t in memory.ticks][:4] == [1, 0, 1, 1]
+    assert all(t["send"][0] == 1 for t in memory.ticks[:4])  # an output: what the kernel decided, for replay
 
 
 def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:
