@@ -29,6 +29,8 @@ from hil.log.errors import DamagedError
 MAX_CHUNK: Final = 32 << 20
 MAX_RECORD: Final = 64 << 20
 _HEAD: Final = struct.Struct("<BQ")
+_LENGTH: Final = struct.Struct("<Q")
+_HEAD_ARRAY: Final = np.dtype([("opcode", "u1"), ("length", "<i8")])
 _PARSERS: Final[dict[int, Any]] = {
     Opcode.HEADER: Header,
     Opcode.SCHEMA: Schema,
@@ -144,14 +146,19 @@ def _decompress(data: bytes, size: int) -> bytes:
 
 def chunk_rows(data: bytes) -> npt.NDArray[np.int64]:
     """Records of a chunk's content as rows of (opcode, start of content, length). Raises DamagedError."""
-    rows, at, size = array("q"), 0, len(data)
-    while at < size:
-        if size - at < _HEAD.size:
-            raise DamagedError("a chunk ends inside a record")
-        opcode, length = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
-        if length > size - at:
-            raise DamagedError("a record runs over the end of its chunk")
-        rows.extend((opcode, at, length))
-        at += length
-    return np.frombuffer(rows, np.int64).reshape(-1, 3)
+    starts, at, size = array("q"), 0, len(data)
+    keep, length_at, head = starts.append, _LENGTH.unpack_from, _HEAD.size
+    try:
+        while at < size:
+            keep(at)
+            at += head + length_at(data, at + 1)[0]
+    except struct.error as error:
+        raise DamagedError("a chunk ends inside a record") from error
+    if at > size:
+        raise DamagedError("a record runs over the end of its chunk")
+    if not starts:
+        return np.empty((0, 3), np.int64)
+    at_all = np.frombuffer(starts, np.int64)
+    windows = np.lib.stride_tricks.sliding_window_view(np.frombuffer(data, np.uint8), head)
+    heads = windows[at_all].view(_HEAD_ARRAY)[:, 0]
+    return np.stack([heads["opcode"], at_all + head, heads["length"]], axis=1)
