@@ -6,7 +6,7 @@ import argparse
 
 from hil.commands.common import Commands, print_json, say
 
-WEB_PORT = 8080
+WEB_PORT, FOXGLOVE_PORT = 8080, 8765
 
 
 def register(commands: Commands) -> None:
@@ -19,7 +19,12 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "--web", action="store_true", help="a page on 127.0.0.1 with plots and a stop button"
     )
-    command.add_argument("--port", type=int, metavar="N", help="of --web; default 8080, 0 takes a free one")
+    command.add_argument(
+        "--port", type=int, metavar="N", help="default 8080 for --web, 8765 for --foxglove; 0: any"
+    )
+    command.add_argument(
+        "--foxglove", action="store_true", help="serve Foxglove, Lichtblick and PlotJuggler on 127.0.0.1"
+    )
 
 
 def cmd_watch(args: argparse.Namespace) -> int:
@@ -32,6 +37,11 @@ def cmd_watch(args: argparse.Namespace) -> int:
         from hil.watch import web
 
         web.run(args.run_name, WEB_PORT if args.port is None else args.port, say)
+        return 0
+    if args.foxglove:
+        from hil.watch import stream
+
+        stream.run(args.run_name, FOXGLOVE_PORT if args.port is None else args.port, say)
         return 0
     look = Look(choose(args.run_name))
     try:

@@ -119,6 +119,11 @@ class Ring:
         return int(self.header[DROPPED_AT])
 
     @property
+    def published(self) -> int:
+        """Records stored since the ring was made."""
+        return int(self.header[HEAD_AT])
+
+    @property
     def high_water(self) -> int:
         """Most records that ever waited, as the consumer saw it."""
         return int(self.header[HIGH_AT])

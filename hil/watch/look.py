@@ -45,12 +45,17 @@ class Look:
                 raise
         except RingError as error:
             raise WatchError(str(error)) from error
-        self._seen = 0
+        self._seen = self._events_seen = 0
 
     def new_ticks(self) -> TickArray:
         """The ticks since the last look, at most what the ring holds."""
         raw, self._seen = self._ticks.since(self._seen)
         return ticks_from(raw)
+
+    def new_events(self) -> list[Event]:
+        """The events since the last look."""
+        raw, self._events_seen = self._events.since(self._events_seen)
+        return unpack_events(raw)
 
     def latest(self, count: int) -> TickArray:
         """The newest ticks."""

@@ -1,0 +1,129 @@
+"""`hil watch --foxglove` as its clients see it: protocol, schemas, messages; and the shipped layouts."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import re
+import struct
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from websockets.asyncio.client import connect
+from websockets.typing import Subprotocol
+
+from hil.app import Overrides
+from hil.demo import emulator_process
+from hil.log.schema import TOPICS, file_descriptor_set
+from hil.signals import FIELDS, TICK, DriveState, ticks_from
+from tests.conftest import CONFIGS
+from tests.process.test_run import flags, hil
+from tests.process.test_watch import wait_for_run
+
+Settings = Callable[..., tuple[str, ...]]
+PROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
+
+
+def fields_of(message: str) -> set[str]:
+    """Field names of a message of the logs."""
+    found = {m.name: {f.name for f in m.field} for m in file_descriptor_set().file[0].message_type}
+    return found[message.removeprefix("hil.")]
+
+
+async def talk(url: str) -> tuple[dict[str, Any], dict[str, Any], dict[str, list[bytes]]]:
+    """Greeting, channels by topic, and some messages of ticks and frames."""
+    async with asyncio.timeout(60), connect(url, subprotocols=PROTOCOLS, proxy=None) as socket:
+        info: dict[str, Any] = {}
+        channels: dict[str, Any] = {}
+        while not info or len(channels) < 4:
+            message = json.loads(await socket.recv())
+            if message["op"] == "serverInfo":
+                info = message
+            if message["op"] == "advertise":
+                channels |= {channel["topic"]: channel for channel in message["channels"]}
+        wanted = ("/tick", "/can/rx", "/can/tx")
+        asked = [{"id": n, "channelId": channels[topic]["id"]} for n, topic in enumerate(wanted)]
+        await socket.send(json.dumps({"op": "subscribe", "subscriptions": asked}))
+        got: dict[str, list[bytes]] = {topic: [] for topic in wanted}
+        while min(map(len, got.values())) < 200:
+            raw = await socket.recv()
+            if isinstance(raw, bytes) and raw[0] == 1:
+                (number,) = struct.unpack_from("<I", raw, 1)
+                got[wanted[number]].append(raw[13:])
+        return info, channels, got
+
+
+@pytest.mark.process
+def test_a_client_gets_the_schemas_and_ticks_of_the_log_files(
+    configs: Path, settings: Settings, tmp_path: Path, channel: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("foxglove", reason="needs the extra foxglove")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    own, path = settings("loop.duration_s=60.0"), configs / "demo.toml"
+    with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
+        wait_for_run(process, channel)
+        with hil("watch", "--foxglove", "--port", "0", channel) as server:
+            assert server.stderr is not None
+            found = re.search(r"ws://127\.0\.0\.1:\d+", line := server.stderr.readline())
+            assert found, line
+            info, channels, got = asyncio.run(talk(found[0]))
+            process.terminate()
+            process.wait(60)
+            assert "the run has ended: stop_requested" in server.stderr.read()
+            assert server.wait(30) == 0
+    assert info["name"] == "hil watch"
+    assert {topic: c["schemaName"] for topic, c in channels.items()}.items() <= TOPICS.items()
+    for c in channels.values():
+        assert c["encoding"] == "protobuf"
+        assert FileDescriptorSet.FromString(base64.b64decode(c["schema"])) == file_descriptor_set()
+    ticks = ticks_from(b"".join(got["/tick"]))
+    assert all(len(raw) == TICK.itemsize for raw in got["/tick"])
+    assert (ticks["k"][1:] > ticks["k"][:-1]).all() and (ticks["state"] == DriveState.OPERATION_ENABLED).all()
+    ids = {
+        topic: {struct.unpack_from("<I", raw, 10)[0] for raw in got[topic]}
+        for topic in got
+        if topic != "/tick"
+    }
+    assert 0x181 in ids["/can/rx"] and 0x201 in ids["/can/tx"]
+
+
+def test_without_the_extra_it_is_one_clear_line() -> None:
+    script = (
+        "import sys; sys.modules['foxglove'] = None; from hil.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, "watch", "--foxglove"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "hil: foxglove-sdk is not installed: pip install 'hil-drive[foxglove]'\n"
+
+
+def test_the_layout_of_lichtblick_and_foxglove_names_what_is_there() -> None:
+    layout = json.loads((CONFIGS / "layouts" / "lichtblick.json").read_text())
+    panels = layout["configById"]
+    paths = [p["value"] for panel in panels.values() for p in panel.get("paths", [])]
+    assert len(paths) > 12
+    for path in paths:
+        topic, _, field = path.partition(".")
+        assert field in fields_of(TOPICS[topic]), path
+    assert all(panel["topicPath"] in TOPICS for panel in panels.values() if "topicPath" in panel)
+    placed = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(layout["layout"]))
+    assert sorted(placed) == sorted(panels)
+
+
+def test_the_layout_of_plotjuggler_names_what_is_there() -> None:
+    curves = [c.get("name", "") for c in ET.parse(CONFIGS / "layouts" / "plotjuggler.xml").iter("curve")]
+    assert len(curves) > 8
+    assert {c.removeprefix("/tick/") for c in curves} <= {f.name for f in FIELDS}
+    assert all(c.startswith("/tick/") for c in curves)
