@@ -1,0 +1,83 @@
+"""Our files in @mcap/core, the reader that Foxglove and Lichtblick are built on: every tick, to the bit.
+
+Needs node, and a folder where `npm install @mcap/core fzstd` was run, named by HIL_NODE_MODULES (its
+node_modules). Skipped without; HIL_REQUIRE_NODE=1 makes that a failure.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.logfiles import HEADER, some_frames, some_ticks, write_log
+
+SCRIPT = """
+const {McapIndexedReader} = require("@mcap/core"), fzstd = require("fzstd");
+const fs = require("fs"), crypto = require("crypto");
+const fd = fs.openSync(process.argv[1], "r");
+const readable = {
+  size: async () => BigInt(fs.fstatSync(fd).size),
+  read: async (offset, length) => {
+    const out = new Uint8Array(Number(length));
+    fs.readSync(fd, out, 0, out.length, Number(offset));
+    return out;
+  },
+};
+const zstd = (data, size) => fzstd.decompress(data, new Uint8Array(Number(size)));
+(async () => {
+  const reader = await McapIndexedReader.Initialize({readable, decompressHandlers: {zstd}});
+  const found = {counts: {}, schemas: [], attachments: [], metadata: []};
+  const hash = crypto.createHash("sha256");
+  for await (const message of reader.readMessages()) {
+    const topic = reader.channelsById.get(message.channelId).topic;
+    found.counts[topic] = (found.counts[topic] || 0) + 1;
+    if (topic === "/tick") hash.update(message.data);
+  }
+  for (const schema of reader.schemasById.values()) found.schemas.push(schema.name);
+  for await (const one of reader.readAttachments()) found.attachments.push(one.name);
+  for await (const one of reader.readMetadata()) found.metadata.push(one.name);
+  found.ticks = hash.digest("hex");
+  console.log(JSON.stringify(found));
+})();
+"""
+
+
+def node(script: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a script; the packages are looked for where HIL_NODE_MODULES says."""
+    env = os.environ | {"NODE_PATH": os.environ.get("HIL_NODE_MODULES", "")}
+    return subprocess.run(
+        ["node", "-e", script, *words], capture_output=True, text=True, timeout=120, env=env, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def needs_node() -> None:
+    try:
+        missing = node("require('@mcap/core'); require('fzstd')").stderr.strip()
+    except FileNotFoundError:
+        missing = "there is no node"
+    if missing and os.environ.get("HIL_REQUIRE_NODE") == "1":
+        pytest.fail(missing)
+    if missing:
+        pytest.skip("node, @mcap/core and fzstd are not there: npm install them, set HIL_NODE_MODULES")
+
+
+@pytest.mark.usefixtures("needs_node")
+def test_mcap_core_reads_every_tick_to_the_bit(tmp_path: Path) -> None:
+    ticks, frames = some_ticks(300), some_frames(900)
+    write_log(tmp_path / "run.mcap", ticks, frames)
+    done = node(SCRIPT, str(tmp_path / "run.mcap"))
+    assert done.returncode == 0 and not done.stderr, done.stderr
+    found = json.loads(done.stdout)
+    received = int((frames["received"] != 0).sum())
+    wanted = {"/tick": 300, "/can/rx": received, "/can/tx": 900 - received, "/event": 6, "/stats": 6}
+    assert found["counts"] == wanted
+    assert found["ticks"] == hashlib.sha256(ticks.tobytes()).hexdigest()
+    assert sorted(found["schemas"]) == ["hil.CanFrame", "hil.Event", "hil.Stats", "hil.Tick"]
+    assert set(found["attachments"]) == set(HEADER["attachments"])
+    assert set(found["metadata"]) == {"run", "units", "meanings", "result"}

@@ -1,0 +1,35 @@
+"""``hil play`` as a process: Ctrl-C ends it at once, and it says what it sent."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import can
+import pytest
+
+from tests.logfiles import some_ticks, write_log
+from tests.unit.test_play import bus_frames
+
+pytestmark = pytest.mark.process
+
+
+def test_ctrl_c_ends_it_and_the_figures_are_printed(tmp_path: Path, channel: str) -> None:
+    write_log(tmp_path / "run.mcap", some_ticks(100), bus_frames(100))
+    with can.Bus(interface="hil-local", channel=channel) as bus:
+        words = ["play", str(tmp_path / "run.mcap"), "-i", "hil-local", "-c", channel]
+        process = subprocess.Popen(
+            [sys.executable, "-m", "hil.cli", *words, "--loop", "1000000", "--json"],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        try:
+            assert bus.recv(60.0) is not None
+            process.send_signal(signal.SIGINT)
+            out, _ = process.communicate(timeout=30)
+        finally:
+            process.kill()
+    found = json.loads(out)
+    assert process.returncode == 130 and found["interrupted"] and found["frames sent"] >= 1
