@@ -20,11 +20,19 @@ def register(commands: Commands) -> None:
         "--web", action="store_true", help="a page on 127.0.0.1 with plots and a stop button"
     )
     command.add_argument(
-        "--port", type=int, metavar="N", help="default 8080 for --web, 8765 for --foxglove; 0: any"
+        "--port", type=_port, metavar="N", help="default 8080 for --web, 8765 for --foxglove; 0: any"
     )
     command.add_argument(
         "--foxglove", action="store_true", help="serve Foxglove, Lichtblick and PlotJuggler on 127.0.0.1"
     )
+
+
+def _port(text: str) -> int:
+    """A TCP port. Raises ValueError, which argparse turns into a refusal."""
+    port = int(text)
+    if not 0 <= port <= 65535:
+        raise ValueError
+    return port
 
 
 def cmd_watch(args: argparse.Namespace) -> int:

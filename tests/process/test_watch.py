@@ -5,7 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import pty
+import select
+import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -102,3 +106,52 @@ def test_another_users_run_is_refused() -> None:
     finally:
         other.kill()
         other.wait()
+
+
+@pytest.mark.parametrize("port", ["70000", "-1", "x"])
+def test_a_port_that_is_none_is_refused(port: str) -> None:
+    done = call("watch", "--web", "--port", port)
+    assert done.returncode == 2 and "--port" in done.stderr and "Traceback" not in done.stderr
+
+
+def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:
+    """What a terminal shows, up to some text; all it shows when the text never comes."""
+    for _ in range(600):
+        if wanted in seen:
+            break
+        if select.select([fd], [], [], 0.1)[0]:
+            try:
+                seen += os.read(fd, 65536)
+            except OSError:  # the other end has gone
+                break
+    return seen
+
+
+def test_keys_in_the_terminal_leave_and_stop(
+    configs: Path, settings: Settings, tmp_path: Path, channel: str
+) -> None:
+    own, path = settings("loop.duration_s=90.0"), configs / "demo.toml"
+    with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
+        wait_for_run(process, channel)
+        for keys, answers in (("q", ["the run goes on"]), ("sn", ["y stops it", "not stopped"]), ("sy", [])):
+            pid, fd = pty.fork()
+            if pid == 0:
+                os.execv(sys.executable, [sys.executable, "-m", "hil.cli", "watch", channel])
+            try:
+                assert b"q leaves" in read_until(fd, b"q leaves")
+                for key, answer in zip(keys, [*answers, "", ""], strict=False):
+                    os.write(fd, key.encode())
+                    wanted = answer.encode() or (
+                        b"y stops it" if key == "s" else b"has ended: stop_requested"
+                    )
+                    assert wanted in read_until(fd, wanted), (keys, key)
+            finally:
+                if keys == "sn":
+                    os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+                os.close(fd)
+            assert (process.poll() is None) == (keys != "sy")
+        process.communicate(timeout=60)
+        assert process.returncode == 0
+    events = open_log(only_log(tmp_path)).events
+    assert ["in the terminal" in event["text"] for event in events if event["kind"] == "stop-asked"] == [True]
