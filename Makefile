@@ -8,7 +8,7 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/unit/test_guard.py tests/unit/test_supervisor.py tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash
+.PHONY: gallery demo test lint unit interpreted vm clean help crash fuzz
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -44,6 +44,9 @@ gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
 
 crash: $(STAMP) ## kill every process of a run, again and again (KILLS=200 SEED=1)
 	$(BIN)/python -m tests.crash.kills --kills $(or $(KILLS),200) --seed $(or $(SEED),1)
+
+fuzz: $(STAMP) ## mutated files, frames and ticks; prints the inputs tried (SECONDS_EACH=10 SEED=1)
+	$(BIN)/python -m tests.fuzz.inputs --seconds $(or $(SECONDS_EACH),10) --seed $(or $(SEED),1)
 
 clean: ## remove the virtual environment and caches
 	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis
