@@ -8,7 +8,7 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/unit/test_guard.py tests/unit/test_supervisor.py tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash fuzz
+.PHONY: gallery demo test lint unit interpreted vm clean help crash faults fuzz
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -41,6 +41,9 @@ vm: $(STAMP) ## the tests on a real SocketCAN bus (natively or in the bench mach
 
 gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
 	$(BIN)/python docs/gallery/make.py
+
+faults: $(STAMP) ## the fault matrix, every row as expected
+	$(BIN)/hil faults configs/faults.toml
 
 crash: $(STAMP) ## kill every process of a run, again and again (KILLS=200 SEED=1)
 	$(BIN)/python -m tests.crash.kills --kills $(or $(KILLS),200) --seed $(or $(SEED),1)

@@ -11,7 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.guard import SAFETY_PARAMS, guard_command, is_denormal, limit_step, to_wire, voltage_limit
+from hil.guard import (
+    SAFETY_PARAMS,
+    guard_command,
+    is_denormal,
+    is_frozen,
+    limit_step,
+    to_wire,
+    voltage_limit,
+    windows_trip,
+)
 from hil.kernel import new_safety_state
 from hil.signals import DriveState, GuardFlag, Reason, RxFlag, new_ticks
 
@@ -152,3 +161,56 @@ def test_whatever_is_asked_what_leaves_is_safe(
 def test_to_wire_is_what_a_codec_does() -> None:
     assert to_wire(0.125, 0.25) == 0.0 and to_wire(0.375, 0.25) == 0.5  # halves to even
     assert limit_step(5.0, 0.0, 2.0) == 2.0 and limit_step(-5.0, 0.0, 2.0) == -2.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_energy_window_trips_on_power_in_either_direction(sign: float) -> None:
+    """300 W into a window of 1 s: e_n = 300 (1 - (1 - T_s)^n) passes 50 J at n = 183."""
+    guard = Guard(energy_max=50.0)
+    guard.s["ua_q"], guard.t["i_q"] = 100.0, 2.0 * sign
+    tick, reason = 0, 0
+    while reason == 0 and tick < 400:
+        reason, tick = windows_trip(guard.p[0], guard.s[0], guard.t), tick + 1
+    assert (tick, reason) == (183, Reason.ENERGY)
+    assert abs(guard.s["energy"][0]) == pytest.approx(300.0 * (1.0 - 0.999**183), rel=1e-12)
+
+
+def test_the_energy_window_forgets() -> None:
+    guard = Guard(energy_max=50.0)
+    guard.s["energy"], guard.t["i_q"] = 49.0, 0.0
+    for _ in range(1000):
+        assert windows_trip(guard.p[0], guard.s[0], guard.t) == Reason.NONE
+    assert guard.s["energy"][0] == pytest.approx(49.0 * 0.999**1000, rel=1e-12)
+
+
+def frozen_after(guard: Guard, ticks: int) -> list[bool]:
+    return [is_frozen(guard.p[0], guard.s[0], guard.t) for _ in range(ticks)]
+
+
+def test_equal_readings_are_frozen_once_the_voltage_has_moved_far_enough() -> None:
+    guard = Guard()
+    guard.t["w"], guard.t["i_q"], guard.t["i_d"] = 10.0, 1.0, 0.1
+    guard.s["ua_q"] = 50.0
+    assert not any(frozen_after(guard, 20))  # equal, but so is the voltage
+    guard.s["ua_q"] = 50.0 + 0.65
+    assert not any(frozen_after(guard, 20))
+    guard.s["ua_q"] = 50.0 + 0.67
+    assert frozen_after(guard, 6) == [False] * 4 + [True] * 2
+    for name in ("w", "i_q", "i_d"):  # a change of any one ends it
+        guard.t[name] += 0.01
+        assert frozen_after(guard, 1) == [False] and guard.s["frozen"][0] == 0
+
+
+def test_a_drive_that_limits_the_voltage_is_not_frozen() -> None:
+    guard = Guard()
+    frozen_after(guard, 1)
+    guard.s["ua_d"], guard.t["limited"] = 100.0, 1
+    assert not any(frozen_after(guard, 20))
+
+
+def test_repeated_readings_of_a_turning_motor_are_frozen_where_sensors_are_noisy() -> None:
+    guard = Guard(repeat_ticks=4)
+    guard.t["w"] = 10.0
+    assert frozen_after(guard, 6) == [False] * 4 + [True] * 2
+    guard.t["w"] = 0.0
+    assert not any(frozen_after(guard, 20))
