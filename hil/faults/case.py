@@ -13,9 +13,11 @@ import json
 import multiprocessing
 import os
 import resource
+import select
 import signal
 import socket
 import struct
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -24,6 +26,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.bus import open_link
+from drivers.errors import DriverError
 from firmware_model.node import BLACK_BOX
 from hil.app import Overrides, Setup, bus_settings, load_setup, run
 from hil.emulate import load_plant, serve
@@ -35,6 +38,7 @@ from hil.replay import replay_log
 from hil.signals import DriveState
 
 RUN_TIMEOUT_S: Final = 60.0
+SAYS_NOTHING_S: Final = 20.0
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
 _fork = multiprocessing.get_context("fork")
@@ -51,9 +55,12 @@ class Forked:
         self.pid = self._process.pid or 0
 
     def line(self) -> str:
-        """Its next line; "" when it has ended."""
+        """Its next line; what there is of it when it ends or says nothing for a while."""
         text = b""
-        while not text.endswith(b"\n") and (byte := os.read(self.out, 1)):
+        while not text.endswith(b"\n") and select.select([self.out], [], [], SAYS_NOTHING_S)[0]:
+            byte = os.read(self.out, 1)
+            if not byte:
+                break
             text += byte
         return text.decode().strip()
 
@@ -82,7 +89,9 @@ def _redirected(write: int, errors: Path, target: Callable[..., None], args: tup
     os.dup2(write, 1)
     with errors.open("wb") as file:
         os.dup2(file.fileno(), 2)
+    sys.stdout, sys.stderr = (os.fdopen(os.dup(fd), "w", encoding="utf-8") for fd in (1, 2))
     target(*args)
+    sys.stdout.flush()
 
 
 def _control(setup: Setup, host: Any) -> None:
@@ -91,7 +100,7 @@ def _control(setup: Setup, host: Any) -> None:
         _step_wall_clock(host)
     try:
         outcome = run(setup).outcome
-    except HilError as error:
+    except (HilError, DriverError) as error:
         os.write(2, f"{error}\n".encode())
         raise SystemExit(2) from error
     os.write(1, f"{outcome.reason}\n".encode())
@@ -210,7 +219,7 @@ def run_row(path: Path, matrix: Matrix, row: Row, folder: Path) -> Result:
         if isinstance(row.host, InterfaceDown):
             own_network()
         _run(path, matrix, row, folder, result)
-    except (HilError, OSError) as error:
+    except (HilError, DriverError, OSError) as error:
         result.why.append(str(error))
     return result
 
@@ -261,7 +270,7 @@ def check_rows(path: Path, matrix: Matrix, rows: list[Row]) -> Setup:
             plant, _ = load_plant(path, setup.config, matrix.plant_settings(row))
             for message in {getattr(fault, "message", "FEEDBACK") for fault in plant.fault}:
                 setup.database.message(message)
-        except HilError as error:
+        except (HilError, DriverError) as error:
             found = error.problems if isinstance(error, ConfigError) else [str(error)]
             problems += [f"row {row.name!r}: {problem}" for problem in found]
     if problems or setup is None:

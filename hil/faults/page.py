@@ -31,9 +31,10 @@ svg text { font: 9px system-ui, sans-serif; fill: #555 }
 INTRO: Final = """
 <p>Each row is a run of its own: emulated drive, controller and log writer as processes on the embedded bus,
 with the fault put in by script. Judged from the log and the emulated drive's black box. Worst values count
-from the fault's beginning and, for speed and current, are the motor's true ones. <em>Safe after</em>: from
-the fault until no voltage was commanded any more and none was at the motor, to a tick. In the plots the
-grey line is the reference, the orange mark the fault, the red mark the stop.</p>
+from the fault's beginning (speed and current under faults of the host: from the run's) and, for speed and
+current, are the motor's true ones. <em>Safe after</em>: from the fault until no voltage was commanded any
+more and none was at the motor, to a tick. In the plots the grey line is the reference, the orange mark the
+fault, the red mark the stop.</p>
 """
 
 

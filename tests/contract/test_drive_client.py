@@ -213,6 +213,16 @@ def test_error_frames_are_flagged_and_remote_frames_are_not_applied() -> None:
     assert tick["rx_flags"] == RxFlag.ERROR_FRAME
 
 
+@pytest.mark.parametrize("error_class", [0x40, 0x100, 0x44])
+def test_bus_off_and_a_restart_after_it_are_a_bus_that_is_down_for_good(error_class: int) -> None:
+    link, client, tick = scripted()
+    link.incoming = [Frame(error_class, bytes(8), ERR_FLAG, False)]
+    client.receive(tick, 0)
+    assert tick["rx_flags"] == RxFlag.ERROR_FRAME | RxFlag.BUS_DOWN
+    with pytest.raises(LinkDown):
+        client.send(tick)
+
+
 def test_after_an_outage_nothing_is_ever_sent() -> None:
     link, client, tick = scripted()
     link.incoming = [LinkDown(100, "down")]

@@ -214,3 +214,14 @@ def test_repeated_readings_of_a_turning_motor_are_frozen_where_sensors_are_noisy
     assert frozen_after(guard, 6) == [False] * 4 + [True] * 2
     guard.t["w"] = 0.0
     assert not any(frozen_after(guard, 20))
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_a_limited_step_stays_in_the_circle(seed: int) -> None:
+    """Both axes limited by themselves reached 311 V of 300: from (212, 212) towards (300, 0)."""
+    random = np.random.default_rng(seed)
+    guard = Guard()
+    for _ in range(40):
+        angle = random.uniform(0, 2 * math.pi)
+        u_q, u_d, *_ = guard.ask(900 * math.cos(angle), 900 * math.sin(angle))
+        assert math.hypot(u_q, u_d) <= 300.0 + 0.01, f"seed {seed}"

@@ -303,3 +303,52 @@ def test_lost_feedback_does_not_undo_a_step_of_the_handshake(bench: Bench) -> No
     assert words[-1][0] == DriveState.OPERATION_ENABLED, words
     sent = [word for _, word in words]
     assert sent == sorted(sent), words  # 0x06, 0x07, 0x0F and never back
+
+
+def echoing(bench: Bench, ticks: int, echo_of: Any) -> list[int]:
+    """Reasons over ticks whose echo the test makes from the last sent counter."""
+    bench.enable()
+    out = []
+    for k in range(ticks):
+        counter = int(bench.t["counter"])
+        out.append(int(bench.step(echo=echo_of(counter, k))["reason"]))
+    return out
+
+
+def test_a_drive_that_no_longer_gets_the_commands_is_left() -> None:
+    stuck = echoing(make("feedback.hold_ticks=40"), 60, lambda counter, k: 7)  # the counter comes round to 7
+    assert stuck.index(Reason.COMMAND_LOST) in (39, 40, 41)
+    late = echoing(make("feedback.hold_ticks=5"), 20, lambda counter, k: (counter - 3) % 16)
+    assert late.index(Reason.COMMAND_LOST) == 5
+    once = echoing(make("feedback.hold_ticks=5"), 200, lambda c, k: (c - (k % 5 == 0)) % 16)
+    assert not any(once)
+
+
+def test_an_echo_of_a_drive_with_its_own_clock_may_be_behind() -> None:
+    cyclic = make("feedback.hold_ticks=5", 'loop.pacing="feedback"')
+    assert not any(echoing(cyclic, 50, lambda counter, k: (counter - 2) % 16))
+
+
+def test_a_speed_that_is_lost_stops_after_its_time() -> None:
+    bench = make("limits.following_error_rad_s=10.0", "limits.following_error_s=0.05").enable()
+    reasons = [int(bench.step(w_ref=40.0, w=29.0 + 0.01 * (k % 3))["reason"]) for k in range(60)]
+    assert reasons.index(Reason.FOLLOWING_ERROR) == 49
+    near = make("limits.following_error_rad_s=10.0", "limits.following_error_s=0.05").enable()
+    assert not any(int(near.step(w_ref=40.0, w=31.0 + 0.01 * (k % 3))["reason"]) for k in range(100))
+
+
+def test_a_d_current_that_is_mostly_large_stops() -> None:
+    bench = make("limits.i_d_max_a=2.0").enable()
+    swing = [4.0 * np.sin(0.4 * k) for k in range(600)]  # |i_d| > 2 A in two ticks of three
+    reasons = [int(bench.step(i_d=i_d)["reason"]) for i_d in swing]
+    assert Reason.CURRENT_UNCONTROLLED in reasons and reasons.index(Reason.CURRENT_UNCONTROLLED) > 200
+    bench = make("limits.i_d_max_a=2.0").enable()
+    assert not any(int(bench.step(i_d=2.3 * np.sin(0.4 * k))["reason"]) for k in range(600))
+
+
+def test_a_shadow_run_is_not_stopped_by_what_another_controller_does() -> None:
+    from hil.design import safety_params
+
+    config = load_toml(CONFIGS / "demo.toml", RunConfig, ["loop.shadow=true", "limits.i_d_max_a=2.0"])
+    p = safety_params(config, WIRE)[0]
+    assert np.isinf(p["w_error_max"]) and np.isinf(p["i_d_max"])
