@@ -14,6 +14,7 @@ dead as a whole (the drive's own watchdog's part).
 from __future__ import annotations
 
 import contextlib
+import errno
 import mmap
 import os
 import select
@@ -82,14 +83,13 @@ class GuardedDrive:
             tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.GUARDIAN_LOST)
 
     def send(self, tick: Any) -> None:
-        """The command, unless the guardian has stopped the drive."""
+        """The command. Raises OSError once the guardian has stopped the drive; the record stays as it is."""
         cells = self._cells
         cells[self._beat] = self._now()
         cells[Word.ARMED] = int(tick["state"] != DriveState.SWITCH_ON_DISABLED)
         cells[self._counter] = int(tick["counter"])
         if cells[self._fired]:
-            tick["send"] = 0
-            return
+            raise OSError(errno.ECANCELED, "the guardian has stopped the drive")
         self._drive.send(tick)
 
     def stop(self) -> None:
