@@ -124,7 +124,8 @@ def test_the_drive_is_driven_by_hand(socketcan: Path) -> None:
         enabled,
         int(DriveState.FAULT),
     ]
-    assert feedback[5]["CurrentQ"] > 0.3 and feedback[6]["CurrentQ"] == 0.0
+    # how fast it got depends on how long the shell took between two frames
+    assert feedback[5]["Speed"] > feedback[4]["Speed"] + 2.0 and abs(feedback[6]["CurrentQ"]) < 0.05
     emergency = [data for can_id, data in frames if can_id == 0x081]
     assert [int.from_bytes(data[:2], "little") for data in emergency] == [0x8130]
 
