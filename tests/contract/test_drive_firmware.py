@@ -275,6 +275,14 @@ def test_a_flood_does_not_keep_the_watchdog_from_tripping(configs: Path) -> None
 
 
 @pytest.mark.compiled  # real time: interpreted kernels are too slow for it
+def test_a_cyclic_drive_stands_still_until_its_first_command(configs: Path) -> None:
+    bench = Bench(configs, clock="realtime", pacing="cyclic")
+    bench.node.warm_up()
+    end = time.monotonic() + 0.05
+    bench.node.run(lambda: time.monotonic() > end)
+    assert bench.ids().count(0x181) > 3 and bench.node.state["t_ns"] == 0
+
+
 def test_a_cyclic_drive_keeps_its_own_time(configs: Path) -> None:
     bench = Bench(configs, clock="realtime", pacing="cyclic")
     bench.node.warm_up()
@@ -285,6 +293,7 @@ def test_a_cyclic_drive_keeps_its_own_time(configs: Path) -> None:
             time.sleep(pause)
             yield None
 
+    bench.command(0)  # its loads and its motion begin with the first command
     bench.link.flood = stalls()
     end = time.monotonic() + 0.5
     bench.node.run(lambda: time.monotonic() > end)
