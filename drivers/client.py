@@ -226,7 +226,7 @@ class DriveClient:
             self._bind(tick)
         flags, self._pending_flags = self._pending_flags, 0
         try:
-            flags |= self._drain_raw(deadline_ns) if self._raw_link else self._drain(deadline_ns)
+            flags |= self._drain(deadline_ns)
         except LinkDown:
             self._down = True
         except LinkError:
@@ -234,8 +234,11 @@ class DriveClient:
         self._flags_cell[0] = int(self._flags_cell[0]) | flags | (BUS_DOWN if self._down else 0)
 
     def _drain(self, deadline_ns: int) -> int:
-        """Flags of all that came; the plain way."""
-        receive, flags, left, more = self._link.receive, 0, 0, DRAIN_MOST
+        """Flags of all that came; on a socket frames are taken whole, without being taken apart first."""
+        raw = self._raw_link
+        receive: Callable[[int], Any] = self._link.receive if raw is None else raw.receive_raw
+        take: Callable[[Any], int] = self._take if raw is None else self._take_raw
+        flags, left, more = 0, 0, DRAIN_MOST
         while more:
             if deadline_ns and (left := deadline_ns - time.monotonic_ns()) < 0:
                 left = 0
@@ -243,33 +246,19 @@ class DriveClient:
             frame = receive(left)
             if frame is None:
                 break
-            flags |= self._take(frame)
+            flags |= take(frame)
             if deadline_ns and flags & FRESH:
                 break
         return flags
 
-    def _drain_raw(self, deadline_ns: int) -> int:
-        """The same on a socket: frames that are known are taken whole, without being taken apart first."""
-        assert self._raw_link is not None  # noqa: S101 - the caller's condition
-        receive, known, late = self._raw_link.receive_raw, self._raw.get, self._late
-        flags, left, more = 0, 0, DRAIN_MOST
-        while more:
-            if deadline_ns and (left := deadline_ns - time.monotonic_ns()) < 0:
-                left = 0
-            more -= left == 0
-            raw = receive(left)
-            if raw is None:
-                break
-            one = known(raw[:5])
-            if one is None or len(raw) != one.size:
-                flags |= self._take_unknown(raw)
-            else:
-                if not self._quiet:
-                    self._on_frame(True, self._now(), one.send_id, raw[DATA_AT : one.end])
-                flags |= one.take(raw, late)
-            if deadline_ns and flags & FRESH:
-                break
-        return flags
+    def _take_raw(self, raw: bytes) -> int:
+        """Handle one frame as it came from the socket; return its flags."""
+        known = self._raw.get(raw[:5])
+        if known is None or len(raw) != known.size:
+            return self._take_unknown(raw)
+        if not self._quiet:
+            self._on_frame(True, self._now(), known.send_id, raw[DATA_AT : known.end])
+        return known.take(raw, self._late)
 
     def _take_unknown(self, raw: bytes) -> int:
         """Flags of what is no frame of ours, or none at all."""

@@ -43,7 +43,6 @@ class Word(IntEnum):
     COUNTER = 2
     FIRED = 3
     GUARD_NS = 4
-    READY = 5
 
 
 class Stopper(Protocol):
