@@ -95,7 +95,7 @@ async def compare(turns: int, seconds: float) -> dict[str, dict[str, float]]:
     )
     try:
         assert server.stderr is not None  # noqa: S101 - PIPE was asked for
-        found = re.search(r"http://[\d.:]+/", server.stderr.readline())
+        found = re.search(r"http://[\d.:]+/[\w-]+/", server.stderr.readline())
         assert found is not None  # noqa: S101 - a taken port can't be: it asked for a free one
         look = await look_at_run()
         return await measure(look, found[0].replace("http", "ws") + "live", turns, seconds)

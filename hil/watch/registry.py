@@ -10,15 +10,18 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import secrets
 import signal
 import stat
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from hil.errors import HilError
+
+TOKEN_BYTES: Final = 32
 
 
 class WatchError(HilError, RuntimeError):
@@ -78,6 +81,20 @@ def _write_new(path: Path, value: Any) -> None:
         os.link(name, path)
     finally:
         Path(name).unlink()
+
+
+def secret() -> str:
+    """This user's token for pages on this machine; it stays, so that an open page finds a new server."""
+    path = folder() / "web.token"
+    with contextlib.suppress(FileExistsError):
+        _write_new(path, secrets.token_urlsafe(TOKEN_BYTES))
+    try:
+        token = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise WatchError(f"{path}: can't be read ({error}); remove it") from error
+    if not isinstance(token, str) or len(token) < TOKEN_BYTES:
+        raise WatchError(f"{path}: holds no token; remove it")
+    return token
 
 
 def own_entry(log: Path, bus: str, rate_hz: int, ticks: int | None) -> Entry:

@@ -1,18 +1,17 @@
 """A page on 127.0.0.1 that shows a run live and can stop it. A process of its own beside the run.
 
-Only this machine reaches it. Requests that name another host (DNS rebinding) and sockets that another page
-opened are refused; a stop needs a token that only the page holds. A viewer that reads slowly misses messages:
-for each there is only the newest waiting, never a queue.
+Only this machine reaches it, and of its users only who knows the address: that begins with a random token,
+kept in a file that only this user can read. Requests that name another host (DNS rebinding) and sockets that
+another page opened are refused. A viewer that reads slowly misses messages: for each there is only the newest
+waiting, never a queue.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hmac
-import html
 import json
 import os
-import secrets
 from collections.abc import Callable
 from http import HTTPStatus
 from importlib.resources import files
@@ -24,7 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from hil.watch.feed import Feed
-from hil.watch.registry import WatchError
+from hil.watch.registry import WatchError, secret
 
 PERIOD_S: Final = 0.1
 MAX_VIEWERS: Final = 50
@@ -34,11 +33,13 @@ POLICY: Final = (
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 ASSETS: Final = {
-    "/watch.js": ("hil.watch", "assets/watch.js", "text/javascript"),
-    "/watch.css": ("hil.watch", "assets/watch.css", "text/css"),
-    "/uplot.js": ("hil.report", "assets/uPlot.iife.min.js", "text/javascript"),
-    "/uplot.css": ("hil.report", "assets/uPlot.min.css", "text/css"),
+    "": ("hil.watch", "assets/watch.html", "text/html"),
+    "watch.js": ("hil.watch", "assets/watch.js", "text/javascript"),
+    "watch.css": ("hil.watch", "assets/watch.css", "text/css"),
+    "uplot.js": ("hil.report", "assets/uPlot.iife.min.js", "text/javascript"),
+    "uplot.css": ("hil.report", "assets/uPlot.min.css", "text/css"),
 }
+STRANGER: Final = b"open the whole address that hil watch --web has printed\n"
 
 
 def asset(package: str, name: str) -> bytes:
@@ -51,31 +52,43 @@ class Web:
 
     def __init__(self, wanted: str | None, port: int) -> None:
         self._feed = Feed(wanted)
-        self._token = secrets.token_urlsafe(32)
+        self._token = secret()
         self.port = port
         self._viewers: dict[ServerConnection, Viewer] = {}
 
     def _hosts(self) -> tuple[str, ...]:
         return (f"127.0.0.1:{self.port}", f"localhost:{self.port}")
 
+    @property
+    def address(self) -> str:
+        """Address of the page; who has it can stop the run."""
+        return f"http://127.0.0.1:{self.port}/{self._token}/"
+
+    def _is_token(self, text: str) -> bool:
+        """Compare in a time that says nothing of where they differ."""
+        return hmac.compare_digest(text.encode(errors="replace"), self._token.encode())
+
     def respond(self, _: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket begin."""
         if request.headers.get("Host") not in self._hosts():
             return _response(HTTPStatus.FORBIDDEN, b"another host name\n")
-        path = request.path.partition("?")[0]
-        if path == "/live":
-            origin = request.headers.get("Origin")
-            if origin not in {None, *(f"http://{host}" for host in self._hosts())}:
-                return _response(HTTPStatus.FORBIDDEN, b"another page\n")
-            full = len(self._viewers) >= MAX_VIEWERS
-            return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n") if full else None
-        if path == "/":
-            page = asset("hil.watch", "assets/watch.html").decode()
-            return _response(HTTPStatus.OK, page.replace("@TOKEN@", html.escape(self._token)).encode())
-        if path in ASSETS:
-            package, name, kind = ASSETS[path]
-            return _response(HTTPStatus.OK, asset(package, name), kind)
-        return _response(HTTPStatus.NOT_FOUND, b"no such page\n", "text/plain")
+        token, slash, name = request.path.partition("?")[0].removeprefix("/").partition("/")
+        if not self._is_token(token) or not slash:
+            return _response(HTTPStatus.FORBIDDEN, STRANGER)
+        if name == "live":
+            return self._refusal(request)
+        if name in ASSETS:
+            package, file, kind = ASSETS[name]
+            return _response(HTTPStatus.OK, asset(package, file), kind)
+        return _response(HTTPStatus.NOT_FOUND, b"no such page\n")
+
+    def _refusal(self, request: Request) -> Response | None:
+        """Why a viewer may not come."""
+        origin = request.headers.get("Origin")
+        if origin not in {None, *(f"http://{host}" for host in self._hosts())}:
+            return _response(HTTPStatus.FORBIDDEN, b"another page\n")
+        full = len(self._viewers) >= MAX_VIEWERS
+        return _response(HTTPStatus.SERVICE_UNAVAILABLE, b"too many viewers\n") if full else None
 
     async def viewer(self, connection: ServerConnection) -> None:
         """One viewer from its coming to its going."""
@@ -95,10 +108,10 @@ class Web:
         """Carry out what a viewer asked; what to tell it."""
         try:
             asked = json.loads(message)
-            token = str(asked["stop"]).encode()
+            token = str(asked["stop"])
         except (ValueError, KeyError, TypeError):
             return "not understood"
-        if not hmac.compare_digest(token, self._token.encode()):
+        if not self._is_token(token):
             return "refused: not the token of this page"
         look = self._feed.look
         if look is None:
@@ -147,7 +160,7 @@ class Viewer:
             return
 
 
-def _response(status: HTTPStatus, body: bytes, kind: str = "text/html") -> Response:
+def _response(status: HTTPStatus, body: bytes, kind: str = "text/plain") -> Response:
     headers = Headers()
     headers["Content-Type"] = f"{kind}; charset=utf-8"
     headers["Content-Length"] = str(len(body))
@@ -177,7 +190,7 @@ async def start(web: Web) -> Server:
 async def _serve(wanted: str | None, port: int, say: Callable[[str], None]) -> None:
     web = Web(wanted, port)
     async with await start(web):
-        say(f"hil: http://127.0.0.1:{web.port}/ (Ctrl-C ends the page, not the run)")
+        say(f"hil: {web.address} (who has it can stop the run; Ctrl-C ends the page, not the run)")
         await web.feed()
 
 

@@ -42,7 +42,7 @@ def server(*words: str) -> Iterator[str]:
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None
     try:
-        found = re.search(r"http://127\.0\.0\.1:\d+/", line := process.stderr.readline())
+        found = re.search(r"http://127\.0\.0\.1:\d+/[\w-]{40,}/", line := process.stderr.readline())
         assert found, line
         yield found[0]
     finally:
@@ -61,6 +61,11 @@ def status(url: str, **headers: str) -> int:
         return error.code
 
 
+def port_of(url: str) -> str:
+    """The port in an address."""
+    return url.split(":")[2].partition("/")[0]
+
+
 async def say(url: str, message: str, origin: str | None = None) -> str:
     """What the server notes to a message over a socket of its own."""
     async with connect(url.replace("http", "ws") + "live", origin=origin, proxy=None) as socket:  # type: ignore[arg-type]
@@ -73,22 +78,51 @@ async def say(url: str, message: str, origin: str | None = None) -> str:
 
 def test_strangers_are_refused() -> None:
     with server("--port", "0") as url:
+        root, token = url[:-44], url[-44:-1]
         assert status(url) == 200 and status(url + "uplot.js") == 200
-        assert status(url + "../pyproject.toml") == 404
+        assert status(url + "../pyproject.toml") == status(url + "x") == 404
+        wrong = token[:-1] + ("a" if token[-1] != "a" else "b")
+        for way in (
+            "",
+            "live",
+            "watch.js",
+            wrong + "/",
+            wrong + "/live",
+            token[:-1] + "/",
+            token + "x/",
+            token,
+        ):
+            assert status(root + way) == 403, way
+        assert status(f"{root}%C3%A9/") == 403
         assert status(url, Host="evil.example") == 403  # a name that was bound to this address
-        assert status(url, Host=f"evil.example:{url.rsplit(':')[-1].strip('/')}") == 403
-        with pytest.raises(InvalidStatus, match="403"):
-            asyncio.run(say(url, "{}", origin="http://evil.example"))
-        for message in ('{"stop": "guess"}', '{"stop": null}', '{"stop": "é"}'):
+        assert status(url, Host=f"evil.example:{port_of(url)}") == 403
+        for address, origin in ((url, "http://evil.example"), (url, "null"), (f"{root}{wrong}/", None)):
+            with pytest.raises(InvalidStatus, match="403"):
+                asyncio.run(say(address, "{}", origin=origin))
+        for message in ('{"stop": "guess"}', '{"stop": null}', '{"stop": "é"}', '{"stop": "\\ud800"}'):
             assert asyncio.run(say(url, message)).startswith("refused")
         for message in ("", "[]", "{", "3", '"stop"', "{}"):
             assert asyncio.run(say(url, message)) == "not understood"
         with urllib.request.urlopen(url, timeout=30) as page:
             assert "default-src 'none'" in page.headers["Content-Security-Policy"]
-            token = re.search(r'hil-token" content="([\w-]{40,})"', page.read().decode())
-        assert token and asyncio.run(say(url, json.dumps({"stop": token[1]}))) == "there is no run to stop"
-        taken = call("watch", "--web", "--port", url.rsplit(":")[-1].strip("/"))
+            assert page.headers["Referrer-Policy"] == "no-referrer" and token not in page.read().decode()
+        assert asyncio.run(say(url, json.dumps({"stop": token}))) == "there is no run to stop"
+        taken = call("watch", "--web", "--port", port_of(url))
         assert taken.returncode == 2 and "choose another: --port" in taken.stderr
+
+
+def test_the_token_is_this_users_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
+    with server("--port", "0") as first, server("--port", "0") as second:
+        assert first[-44:] == second[-44:]
+    path = tmp_path / "hil" / "web.token"
+    assert path.stat().st_mode & 0o777 == 0o600
+    for text in ('""', "", "[]"):
+        path.write_text(text)
+        refused = call("watch", "--web", "--port", "0")
+        assert refused.returncode == 2 and "remove it" in refused.stderr
+    path.unlink()
+    with server("--port", "0") as third:
+        assert third[-44:] != first[-44:]
 
 
 def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
@@ -106,7 +140,10 @@ def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
                 seen = page.wait_for(LAST)
                 page.wait_for(f"{LAST} > {seen}")
                 assert page.evaluate("document.querySelectorAll('.plot canvas').length") == 5
-                assert page.evaluate("document.querySelector('#state').className") == "good"
+                state = page.evaluate(
+                    "[...['className', 'textContent']].map(k => document.querySelector('#state')[k])"
+                )
+                assert state == ["good", "operation enabled"]
             pages[0].click("#stop")
             process.communicate(timeout=60)
             assert process.returncode == 0
@@ -121,13 +158,17 @@ def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
     assert len(asked) == 1 and "stop button" in asked[0]
 
 
-def test_the_page_comes_back_after_the_server(browser: Browser) -> None:
-    page = browser.page()
+def test_the_page_comes_back_after_the_server_and_says_when_it_is_anothers(
+    browser: Browser, tmp_path: Path
+) -> None:
+    page, state = browser.page(), "document.querySelector('#state').textContent"
     with server("--port", "0") as url:
         page.open(url)
-        page.wait_for("document.querySelector('#state').textContent === 'waiting for a run'")
-        token = page.evaluate("document.querySelector('meta[name=hil-token]').content")
-    page.wait_for("document.querySelector('#state').textContent.startsWith('no connection')")
-    with server("--port", url.rsplit(":")[-1].strip("/")):
-        page.wait_for("document.querySelector('#state')?.textContent === 'waiting for a run'")
-        assert page.evaluate("document.querySelector('meta[name=hil-token]').content") != token
+        page.wait_for(f"{state} === 'waiting for a run'")
+    page.wait_for(f"{state}.startsWith('no connection')")
+    with server("--port", port_of(url)):
+        page.wait_for(f"{state} === 'waiting for a run'")
+    page.wait_for(f"{state}.startsWith('no connection')")
+    (tmp_path / "hil" / "web.token").unlink()
+    with server("--port", port_of(url)):
+        page.wait_for(f"{state}.startsWith('another hil watch serves this port')")

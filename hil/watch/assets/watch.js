@@ -11,7 +11,7 @@
   ];
   const get = id => document.getElementById(id);
   const colour = name => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
-  const token = document.querySelector("meta[name=hil-token]").content;
+  const token = location.pathname.split("/")[1]; // the address is the key
   let kept = {t: []}, plots = [], socket = null, asked = false;
 
   function build() {
@@ -99,16 +99,17 @@
   }
 
   function connect() {
-    socket = new WebSocket(`ws://${location.host}/live`);
+    socket = new WebSocket(`ws://${location.host}/${token}/live`);
     socket.onmessage = event => on(JSON.parse(event.data));
     socket.onclose = () => { idle("no connection; trying again"); setTimeout(again, RETRY_MS); };
   }
 
-  // A server that was started again has another token: ask for the page first, quietly, then load it anew.
+  // Ask for the page first, quietly: a socket that can't open would complain on the console each time.
   async function again() {
     try {
-      const page = await (await fetch("/")).text();
-      if (!page.includes(`content="${token}"`)) location.reload(); else connect();
+      const page = await fetch(location.pathname);
+      if (page.ok) connect();
+      else idle("another hil watch serves this port: open the address that it has printed");
     } catch { setTimeout(again, RETRY_MS); }
   }
 
