@@ -6,6 +6,8 @@ A frame is applied whole or not at all; a value that does not fit raises.
 from __future__ import annotations
 
 import copy
+import logging
+from collections import Counter
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from drivers.signal import Signal, compile_signal
 MAX_DBC_BYTES = 4 << 20
 FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
 _NODE_BITS = 0x7F
+logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of (messages twice) is refused here
 _WRITERS_KEPT = 64
 
 
@@ -147,6 +150,7 @@ class Database:
             parsed: Any = cantools.database.load_string(self.text, database_format="dbc", strict=True)
         except Exception as error:
             raise DatabaseError(f"{path}: is no usable DBC: {_first_line(error)}") from error
+        _refuse_twice(path, parsed.messages)
         self.messages: dict[str, Message] = {}
         self.unusable: dict[str, str] = {}
         for one in parsed.messages:
@@ -186,6 +190,19 @@ def _read(path: Path) -> str:
 
 def _first_line(error: Exception) -> str:
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+
+
+def _refuse_twice(path: Path, parsed: Any) -> None:
+    """A name or an identifier that two messages have says nothing certain. Raises DatabaseError."""
+    names = Counter(one.name for one in parsed)
+    ids = Counter((one.frame_id, one.is_extended_frame) for one in parsed)
+    twice = [f"message {name} is there {count} times" for name, count in names.items() if count > 1]
+    for (can_id, extended), count in ids.items():
+        both = {one.name for one in parsed if (one.frame_id, one.is_extended_frame) == (can_id, extended)}
+        if count > 1 and len(both) > 1:
+            twice.append(f"identifier 0x{can_id:X} is that of {' and '.join(sorted(both))}")
+    if twice:
+        raise DatabaseError(f"{path}: {'; '.join(twice)}; leave one of each")
 
 
 def _identifier(parsed: Any, node_id: int) -> int:

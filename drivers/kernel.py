@@ -32,6 +32,35 @@ class InterfaceFacts:
     tx_errors: int | None = None
     rx_errors: int | None = None
     bus_off_count: int | None = None
+    warning_count: int | None = None
+    passive_count: int | None = None
+    restart_count: int | None = None
+    bus_errors: int | None = None
+    tx_dropped: int = 0
+    tx_frames: int = 0
+    rx_frames: int = 0
+
+    def text(self) -> str:
+        """The facts in one line; what the driver does not tell is left out."""
+        known = (
+            ("state", self.state),
+            ("error counter tx", self.tx_errors),
+            ("rx", self.rx_errors),
+            ("times error-warning", self.warning_count),
+            ("error-passive", self.passive_count),
+            ("bus-off", self.bus_off_count),
+            ("restarted", self.restart_count),
+            ("bus errors", self.bus_errors),
+            ("bitrate", self.bitrate),
+            ("data bitrate", self.data_bitrate),
+            ("restart-ms", self.restart_ms),
+            ("queue length", self.queue_length),
+            ("frames sent", self.tx_frames),
+            ("dropped", self.tx_dropped),
+            ("received", self.rx_frames),
+        )
+        told = ", ".join(f"{name} {value}" for name, value in known if value is not None)
+        return f"{self.name} {self.kind} {'up' if self.up else 'down'}: {told}"
 
 
 def interface_facts(name: str) -> InterfaceFacts | None:
@@ -58,6 +87,7 @@ def _facts(link: dict[str, Any]) -> InterfaceFacts:
     info = link.get("linkinfo", {})
     data = info.get("info_data", {})
     errors = data.get("berr_counter", {})
+    counts, traffic = info.get("info_xstats", {}), link.get("stats64", {})
     controller = info.get("info_kind") == "can"
     return InterfaceFacts(
         name=link["ifname"],
@@ -72,5 +102,12 @@ def _facts(link: dict[str, Any]) -> InterfaceFacts:
         restart_ms=data.get("restart_ms", 0) if controller else None,
         tx_errors=errors.get("tx"),
         rx_errors=errors.get("rx"),
-        bus_off_count=info.get("info_xstats", {}).get("bus_off"),
+        bus_off_count=counts.get("bus_off"),
+        warning_count=counts.get("error_warning"),
+        passive_count=counts.get("error_passive"),
+        restart_count=counts.get("restarts"),
+        bus_errors=counts.get("bus_error"),
+        tx_dropped=traffic.get("tx", {}).get("dropped", 0),
+        tx_frames=traffic.get("tx", {}).get("packets", 0),
+        rx_frames=traffic.get("rx", {}).get("packets", 0),
     )

@@ -191,6 +191,21 @@ def _is_emulated(interface: str, channel: str) -> bool:
     return facts.kind == "vcan" if facts else channel.startswith("vcan")
 
 
+def note_interface(config: RunConfig, recorder: Recorder, t_ns: int, k: int) -> None:
+    """Log what the kernel says of the interface now: its state, error counters, bitrate, restart, queue.
+
+    Asked before the loop and after it, never in a tick. A bus that the kernel does not know is left out.
+    """
+    if config.bus.interface != "socketcan":
+        return
+    try:
+        facts = interface_facts(config.bus.channel)
+        text = facts.text() if facts else f"there is no interface {config.bus.channel}"
+    except DriverError as error:
+        text = str(error)
+    recorder.event(t_ns, k, "interface", text)
+
+
 @contextlib.contextmanager
 def sending_bus(
     interface: str, channel: str, bitrate: int, fd: bool, *, real_allowed: bool
@@ -436,6 +451,7 @@ def _run_armed(
     outcome, failure, processor_ns = Outcome(), "", 0
     try:
         with stopping_on_signals(request):
+            note_interface(setup.config, recorder, clock.now_ns(), 0)
             if clock.name == "monotonic":
                 grants = realtime.acquire(setup.config.realtime)
             bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
@@ -449,6 +465,7 @@ def _run_armed(
         raise
     finally:
         realtime.release()
+        note_interface(setup.config, recorder, clock.now_ns(), outcome.ticks + outcome.skipped)
         if asked := who_asked(os.getpid()):
             t_ns, k, who = asked
             recorder.event(t_ns, k, "stop-asked", who)

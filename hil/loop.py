@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from hil.ports import Clock, Drive, Recorder
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, cell
+from hil.trouble import TROUBLE, Trouble
 
 Pacing = Literal["sync", "feedback", "timer"]
 Step = Callable[[TickArray], None]
@@ -94,7 +95,7 @@ class Loop:
         self._prepare, self._step = prepare, step
         self._ticks, self._plan, self._request = ticks, plan, request
         self._cells: Any = Cells(ticks)
-        self._outcome = Outcome()
+        self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
         self._arrived_ns = 0
         self._state = int(DriveState.SWITCH_ON_DISABLED)
 
@@ -147,6 +148,8 @@ class Loop:
         if t.send[0]:
             self._send(tick)
         t.sent_ns[0] = min(now() - deadline_ns, MAX_NS)
+        if t.rx_flags[0] & TROUBLE:
+            self._trouble.note(deadline_ns, k, t.rx_flags[0])
         if t.state[0] != self._state:
             self._state = t.state[0]
             self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))

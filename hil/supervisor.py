@@ -26,7 +26,8 @@ def leaky(level: int, error: bool) -> int:
 def judge_bus(p: Any, s: Any, t: Any) -> int:
     """Return the Reason to stop that this tick's traffic gives, 0 for none."""
     flags = t["rx_flags"]
-    s["crc_level"] = leaky(s["crc_level"], (flags & (RxFlag.CRC_ERROR | RxFlag.LENGTH_ERROR)) != 0)
+    damaged = flags & (RxFlag.CRC_ERROR | RxFlag.LENGTH_ERROR | RxFlag.ERROR_FRAME)
+    s["crc_level"] = leaky(s["crc_level"], damaged != 0)
     s["counter_level"] = leaky(
         s["counter_level"], (flags & (RxFlag.COUNTER_REPEATED | RxFlag.COUNTER_JUMP)) != 0
     )

@@ -263,6 +263,34 @@ def test_a_missing_message_and_a_missing_signal_are_named() -> None:
     assert "message FEEDBACK has no signal Spin; it has Crc, Counter" in _refusal(HOUSE, "FEEDBACK", "Spin")
 
 
+def _with_message_twice(number: str, name: str) -> str:
+    """The house DBC with FEEDBACK once more, under another identifier or name."""
+    text = HOUSE.read_text(encoding="cp1252")
+    begin = text.index("BO_ 385 FEEDBACK:")
+    block = text[begin : text.index("BO_ ", begin + 1)]
+    return text.replace(block, block + block.replace("BO_ 385 FEEDBACK:", f"BO_ {number} {name}:"))
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "words"),
+    [
+        ("385", "FEEDBACK", "message FEEDBACK is there 2 times"),
+        ("386", "FEEDBACK", "message FEEDBACK is there 2 times"),
+        ("385", "OTHER", "identifier 0x181 is that of FEEDBACK and OTHER"),
+    ],
+)
+def test_a_message_that_is_there_twice(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], number: str, name: str, words: str
+) -> None:
+    path = tmp_path / "twice.dbc"
+    path.write_text(_with_message_twice(number, name), encoding="cp1252")
+    refusal = _refusal(path)
+    assert words in refusal and "leave one of each" in refusal and "\n" not in refusal
+    assert capfd.readouterr().err == ""
+    path.write_text(_with_message_twice("386", "OTHER"), encoding="cp1252")
+    assert Database(path).message("OTHER").can_id == 386
+
+
 def test_overlapping_signals(tmp_path: Path) -> None:
     path = _edited(tmp_path, "SG_ Speed : 16|16@1-", "SG_ Speed : 10|16@1-")
     assert "overlapping" in _refusal(path)

@@ -67,7 +67,9 @@ def test_only_the_composition_root_knows_drivers_and_the_emulator(path: Path) ->
 @pytest.mark.parametrize("name", ["loop", "supervisor", "guard", "kernel"])
 def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
     own = starts(imports(ROOT / "hil" / f"{name}.py"), "hil")
-    assert own <= starts(own, "hil.ports", "hil.signals", "hil.control", "hil.guard", "hil.supervisor")
+    assert own <= starts(
+        own, "hil.ports", "hil.signals", "hil.control", "hil.guard", "hil.supervisor", "hil.trouble"
+    )
 
 
 def test_nothing_reads_a_clock_but_the_places_that_may() -> None:

@@ -18,7 +18,8 @@ SICK_FD = """[{},{"ifname":"can1","flags":["NOARP","ECHO"],"mtu":72,"operstate":
 "linkinfo":{"info_kind":"can","info_data":{"ctrlmode":["FD"],"state":"BUS-OFF",
 "berr_counter":{"tx":248,"rx":3},"restart_ms":100,"bittiming":{"bitrate":500000,"sample_point":"0.875"},
 "data_bittiming":{"bitrate":2000000,"sample_point":"0.750"}},"info_xstats":{"restarts":1,"bus_error":7,
-"arbitration_lost":0,"error_warning":2,"error_passive":2,"bus_off":4}}}]"""
+"arbitration_lost":0,"error_warning":2,"error_passive":2,"bus_off":4}},
+"stats64":{"rx":{"packets":80},"tx":{"packets":90,"dropped":5}}}]"""
 FIXED_RATES = """[{"ifname":"can2","flags":["UP"],"mtu":16,"txqlen":10,"linkinfo":{"info_kind":"can",
 "info_data":{"state":"STOPPED","bittiming_bitrate":125000,"data_bittiming_bitrate":1000000}}}]"""
 VCAN = '[{"ifname":"vcan0","flags":["NOARP","UP"],"mtu":72,"txqlen":1000,"linkinfo":{"info_kind":"vcan"}}]'
@@ -32,8 +33,19 @@ def test_a_card_that_is_well() -> None:
 
 def test_a_card_that_is_off_the_bus() -> None:
     assert parse_link(SICK_FD, "can1") == InterfaceFacts(
-        "can1", "can", False, 72, 1000, "BUS-OFF", 500_000, 2_000_000, 100, 248, 3, 4
+        "can1", "can", False, 72, 1000, "BUS-OFF", 500_000, 2_000_000, 100, 248, 3, 4, 2, 2, 1, 7, 5, 90, 80
     )
+
+
+def test_the_facts_in_one_line() -> None:
+    sick, vcan = parse_link(SICK_FD, "can1"), parse_link(VCAN, "vcan0")
+    assert sick is not None and vcan is not None
+    assert sick.text() == (
+        "can1 can down: state BUS-OFF, error counter tx 248, rx 3, times error-warning 2, error-passive 2, "
+        "bus-off 4, restarted 1, bus errors 7, bitrate 500000, data bitrate 2000000, restart-ms 100, "
+        "queue length 1000, frames sent 90, dropped 5, received 80"
+    )
+    assert vcan.text() == "vcan0 vcan up: queue length 1000, frames sent 0, dropped 0, received 0"
 
 
 def test_an_adapter_with_fixed_bitrates() -> None:

@@ -9,6 +9,7 @@ import pytest
 from hil.clock import FakeClock, LockstepClock, RealClock
 from hil.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
+from hil.trouble import QUIET_TICKS
 
 MS = 1_000_000
 
@@ -50,6 +51,7 @@ class Memory:
     def __init__(self) -> None:
         self.ticks: list[TickArray] = []
         self.events: list[str] = []
+        self.said: list[tuple[str, int, str]] = []
 
     def tick(self, tick: TickArray) -> None:
         self.ticks.append(tick.copy())
@@ -59,6 +61,7 @@ class Memory:
 
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         self.events.append(kind)
+        self.said.append((kind, k, text))
 
 
 def nothing(ticks: TickArray) -> None:
@@ -151,6 +154,29 @@ def test_a_command_that_fails_is_logged() -> None:
     loop.run()
     assert memory.events == ["state", "send-failed", "stop"]
     assert all(t["send"][0] == 1 for t in memory.ticks[:4])  # an output: what the kernel decided, for replay
+
+
+class TroubledDrive(ScriptedDrive):
+    """Feedback of which some ticks carry the given bits of rx_flags, too."""
+
+    def __init__(self, flags: dict[int, int]) -> None:
+        super().__init__()
+        self.flags = flags
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        super().receive(tick, deadline_ns)
+        tick["rx_flags"] |= self.flags.get(int(tick["k"]), 0)
+
+
+def test_trouble_on_the_bus_is_an_event_when_it_begins() -> None:
+    crc, error = int(RxFlag.CRC_ERROR), int(RxFlag.ERROR_FRAME)
+    later = 13 + QUIET_TICKS + 1
+    flags = {10: crc, 11: crc, 12: crc | error, 13: error, later: error | int(RxFlag.STATUS), later + 1: crc}
+    loop, memory, _ = make(TroubledDrive(flags), FakeClock(), ticks=later + 10)
+    loop.run()
+    bus = [(k, text) for kind, k, text in memory.said if kind == "bus"]
+    expected = [(10, "CRC_ERROR"), (12, "ERROR_FRAME"), (later, "ERROR_FRAME"), (later + 1, "CRC_ERROR")]
+    assert bus == expected
 
 
 def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:

@@ -141,6 +141,7 @@ STOPS: list[tuple[str, Reason, int, dict[str, float], int]] = [
     ("stale", Reason.STALE_FEEDBACK, 0, {}, 60),
     ("crc", Reason.CRC_ERRORS, FRESH | int(RxFlag.CRC_ERROR), {}, 8),
     ("length", Reason.CRC_ERRORS, FRESH | int(RxFlag.LENGTH_ERROR), {}, 8),
+    ("error frames", Reason.CRC_ERRORS, FRESH | int(RxFlag.ERROR_FRAME), {}, 8),
     ("counter", Reason.COUNTER_ERRORS, FRESH | int(RxFlag.COUNTER_JUMP), {}, 8),
     ("repeated counter", Reason.COUNTER_ERRORS, FRESH | int(RxFlag.COUNTER_REPEATED), {}, 8),
     ("bus down", Reason.BUS_DOWN, int(RxFlag.BUS_DOWN), {}, 0),

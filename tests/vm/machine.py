@@ -29,7 +29,7 @@ TOOLS = {
     "dpkg": "dpkg",
     "apt-get": "apt",
 }
-MODULES = ("virtio_pci", "9pnet_virtio", "9p", "kvaser_pci", "can_raw", "can_bcm", "vcan")
+MODULES = ("virtio_pci", "9pnet_virtio", "9p", "kvaser_pci", "can_raw", "can_bcm", "vcan", "sch_tbf")
 TIMEOUT_S = 300.0
 
 
