@@ -10,7 +10,7 @@ import errno
 import select
 import socket
 from dataclasses import dataclass
-from typing import NamedTuple, NoReturn, Protocol
+from typing import Any, NamedTuple, NoReturn, Protocol
 
 import can
 
@@ -21,6 +21,8 @@ _DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO, errno.EBA
 _FULL = {errno.ENOBUFS, errno.EAGAIN}
 _FLAGS = EFF_FLAG | RTR_FLAG | ERR_FLAG
 DISCARD_MOST = 100_000
+PLAIN = ("socketcan", "hil-local", "virtual")
+"""Interfaces that are all there is to be said of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,16 +221,21 @@ class GenericLink:
 
 
 def open_link(settings: BusSettings) -> Link:
-    """Open a bus. Raises LinkError with python-can's own words when it can't be opened."""
-    options: dict[str, object] = {"fd": settings.fd}
-    if settings.interface not in ("socketcan", "hil-local", "virtual"):
-        options["bitrate"] = settings.bitrate
+    """Open a bus. Raises LinkError with python-can's own words when it can't be opened.
+
+    python-can's own configuration (can.conf, CAN_INTERFACE and the like) never says which bus it is, and
+    adds to a plain bus nothing at all; an adapter finds its own options there (a serial number).
+    """
+    options: dict[str, Any] = {"fd": settings.fd}
+    adapter = settings.interface not in PLAIN
+    if adapter:
+        options |= {"bitrate": settings.bitrate, "receive_own_messages": False, "can_filters": None}
         if settings.data_bitrate:
             options["data_bitrate"] = settings.data_bitrate
     if settings.interface == "virtual":
         options = {}
     try:
-        bus = can.Bus(interface=settings.interface, channel=settings.channel, **options)  # type: ignore[arg-type]
+        bus = can.Bus(settings.channel, settings.interface, ignore_config=not adapter, **options)
     except (can.CanError, OSError, ValueError, ImportError) as error:
         remedy = f"is {settings.channel!r} up? ip link set {settings.channel} up"
         if settings.interface != "socketcan":

@@ -11,6 +11,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -202,6 +204,56 @@ def test_a_bus_that_is_not_there_is_one_clear_line(interface: str) -> None:
     with pytest.raises(LinkError, match="can't open bus") as caught:
         open_link(BusSettings(interface, "can77"))
     assert f"{interface}:can77" in str(caught.value)
+
+
+class Adapter(can.BusABC):
+    """A python-can interface that keeps what it is opened with."""
+
+    def __init__(self, channel: str, **options: object) -> None:
+        self.options = {"channel": channel} | options
+        super().__init__(channel)
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        raise NotImplementedError
+
+
+@pytest.fixture
+def configured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A user whose python-can is configured for another bus."""
+    own = (
+        "interface = virtual\nchannel = other\nbitrate = 125000\nreceive_own_messages = true\nserial = 4711\n"
+    )
+    (tmp_path / "can.conf").write_text(f"[default]\n{own}")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("CAN_INTERFACE", "virtual")
+    monkeypatch.setenv("CAN_CHANNEL", "another")
+    monkeypatch.setenv("CAN_BITRATE", "250000")
+
+
+@pytest.mark.usefixtures("configured")
+def test_python_cans_configuration_never_says_which_bus(kind: str, channel: str) -> None:
+    settings = BusSettings(kind, channel)
+    one, other = open_link(settings), open_link(settings)
+    one.send(0x123, b"\x01")
+    assert other.receive(WAIT_NS) == Frame(0x123, b"\x01", 0, False)
+    assert one.receive(20_000_000) is None, "own frames came back"
+    one.close()
+    other.close()
+
+
+@pytest.mark.usefixtures("configured")
+def test_an_adapter_finds_its_own_options_in_can_conf(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(can.interfaces.BACKENDS, "adapter", (__name__, "Adapter"))
+    monkeypatch.setattr(can.util, "VALID_INTERFACES", can.util.VALID_INTERFACES | {"adapter"})
+    link: Any = open_link(BusSettings("adapter", "usb0", 500_000))
+    assert link._bus.options == {
+        "channel": "usb0",
+        "bitrate": 500_000,
+        "fd": False,
+        "receive_own_messages": False,
+        "can_filters": None,
+        "serial": 4711,
+    }
 
 
 def test_link_errors_are_oserrors_told_apart() -> None:
