@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,20 @@ class Seen:
     folder: Path
 
 
-def frames_of(path: Path) -> list[tuple[int, bytes]]:
+def timed_frames_of(path: Path) -> list[tuple[float, int, bytes]]:
+    """(time, id, data) of what candump wrote; remote and error frames are left out."""
     rows = []
     for line in path.read_text().splitlines():
-        head, _, data = line.split()[2].partition("#")
-        if not data.startswith("R"):
-            rows.append((int(head, 16), bytes.fromhex(data[2:] if data.startswith("#") else data)))
+        stamp, _, frame = line.split()[:3]
+        head, _, data = frame.partition("#")
+        if not data.startswith("R") and not (len(head) == 8 and int(head, 16) >> 29):
+            raw = bytes.fromhex(data[2:] if data.startswith("#") else data)
+            rows.append((float(stamp.strip("()")), int(head, 16), raw))
     return rows
+
+
+def frames_of(path: Path) -> list[tuple[int, bytes]]:
+    return [(can_id, data) for _, can_id, data in timed_frames_of(path)]
 
 
 def steady(run: Seen, name: str) -> None:
@@ -185,6 +193,9 @@ def test_a_bus_outage_ends_the_run_and_nothing_stale_is_sent(socketcan: Path) ->
         ("drive_dies", "stale_feedback"),
         ("second_master", "foreign_command"),
         ("injected_beyond_the_budget", "crc_errors"),
+        ("stale_counters_beyond_the_budget", "counter_errors"),
+        ("error_frames_beyond_the_budget", "crc_errors"),
+        ("bus_off_is_reported", "bus_down"),
     ],
 )
 def test_each_fault_stops_with_its_reason(socketcan: Path, name: str, reason: str) -> None:
@@ -203,12 +214,62 @@ def test_a_few_bad_frames_and_a_flood_are_ridden_through(socketcan: Path) -> Non
     assert replay_log(run.log).verdict == "same"
 
 
+def events_of(run: Seen, kind: str) -> str:
+    return "; ".join(event["text"] for event in run.log.events if event["kind"] == kind)
+
+
+@pytest.mark.parametrize(
+    ("name", "flag"),
+    [("stale_counter_ridden_through", "COUNTER_JUMP"), ("error_frame_ridden_through", "ERROR_FRAME")],
+)
+def test_what_is_within_the_budget_is_ridden_through_with_an_event(
+    socketcan: Path, name: str, flag: str
+) -> None:
+    run = seen(socketcan, name)
+    assert run.result["returncode"] == 0 and run.result["run"]["ended"] == "stop_requested"
+    assert flag in events_of(run, "bus")
+    assert (run.log.ticks["rx_flags"] & int(RxFlag[flag])).any()
+
+
+def test_a_full_queue_ends_the_run_and_what_was_queued_moves_nothing(socketcan: Path) -> None:
+    """ENOBUFS: a stop with its reason; the frames that the kernel held back find a drive in FAULT."""
+    run = seen(socketcan, "queue_is_full")
+    assert run.result["returncode"] == 1 and run.result["run"]["ended"] == "send_failed"
+    assert "queue is full" in events_of(run, "send-failed") and "SEND_FAILED" in events_of(run, "bus")
+    assert "SEND_FAILED" in events_of(run, "stop")
+    dropped = re.search(r"dropped (\d+)", events_of(run, "interface").split("; ")[-1])
+    assert dropped and int(dropped[1]) > 0
+    ticks = run.log.ticks
+    stopped = ticks[ticks["reason"] != 0]
+    assert len(stopped) and not stopped["u_q"].any() and not stopped["u_d"].any()
+    drained = json.loads((run.folder / "marks.json").read_text())["drained"]
+    late = [(can_id, data) for t, can_id, data in timed_frames_of(run.folder / "wire.log") if t > drained]
+    commands = [data for can_id, data in late if can_id == 0x201]
+    assert 0 < len(commands) <= 6, "the queue holds ten frames, about half of them commands"
+    states = [HOUSE.message("FEEDBACK").decode(data) for can_id, data in late if can_id == 0x181]
+    assert states and all(s["State"] == DriveState.FAULT and abs(s["CurrentQ"]) < 0.05 for s in states)
+    assert [can_id for can_id, _ in late if can_id not in (0x181, 0x281, 0x701, 0x081)][-2:] == [0x7E0, 0x080]
+
+
+@pytest.mark.parametrize("name", ["kvaser_pair", "queue_is_full", "interface_goes_down_and_up"])
+def test_the_log_carries_what_the_kernel_says_of_the_interface(socketcan: Path, name: str) -> None:
+    """Before and after the loop; a card tells its state, counters, bitrate and restart-ms, vcan its queue."""
+    run = seen(socketcan, name)
+    texts = [event["text"] for event in run.log.events if event["kind"] == "interface"]
+    assert len(texts) == 2 and all("queue length" in text for text in texts)
+    if name != "interface_goes_down_and_up":
+        assert all("state ERROR-ACTIVE, error counter tx 0, rx 0" in text for text in texts)
+        assert all("bitrate 1000000, restart-ms 0, queue length 10" in text for text in texts)
+    frames = [int(re.search(r"frames sent (\d+)", text)[1]) for text in texts]  # type: ignore[index]
+    assert frames[1] > frames[0] + 500
+
+
 def test_a_bus_without_a_partner_ends_the_run(socketcan: Path) -> None:
-    run = seen(socketcan, "no_partner_fills_the_queue")
+    run = seen(socketcan, "no_partner")
     assert run.result["returncode"] == 1
-    assert run.result["run"]["ended"] in ("stale_feedback", "send_failed")
+    assert run.result["run"]["ended"] == "stale_feedback"
     assert_nothing_after_the_stop(run)
     link = json.loads((run.folder / "link.json").read_text())[0]
     # the emulated wire acknowledges even without a partner, so the card stays error-active and the drive's
-    # silence ends the run; on a real wire the queue fills first
+    # silence ends the run; on a real wire the queue fills first, which queue_is_full makes
     assert link["linkinfo"]["info_data"]["state"] in ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE")

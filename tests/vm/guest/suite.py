@@ -197,10 +197,82 @@ def injected_beyond_the_budget() -> None:
         sh("cangen", "vcan0", "-I", "181", "-L", "8", "-D", "0011223344556677", "-g", "1", "-n", "60")
 
 
-def no_partner_fills_the_queue() -> None:
+def stale_counter_ridden_through() -> None:
+    """Feedback of before, whole and with a valid CRC: its counter tells that it is old."""
+    with Scenario("stale_counter_ridden_through", seconds=4.0) as s:
+        s.start()
+        s.running()
+        for _ in range(3):
+            old = next(line for line in s.dump.read_text().splitlines() if " 181#" in line).split()[2]
+            sh("cansend", "vcan0", old)
+            time.sleep(0.1)
+
+
+def stale_counters_beyond_the_budget() -> None:
+    with Scenario("stale_counters_beyond_the_budget", seconds=30.0) as s:
+        s.start()
+        s.running()
+        old = next(line for line in s.dump.read_text().splitlines() if " 181#" in line).split()[2][4:]
+        sh("cangen", "vcan0", "-I", "181", "-L", "8", "-D", old, "-g", "1", "-n", "200")
+
+
+# SocketCAN's error frames: class, then what the controller tells (passive), then its counters tx and rx
+PASSIVE = "20000004#0030000000008888"
+BUS_OFF = "20000040#0000000000000000"
+
+
+def error_frame_ridden_through() -> None:
+    with Scenario("error_frame_ridden_through", seconds=3.0) as s:
+        s.start()
+        s.running()
+        sh("cansend", "vcan0", PASSIVE)
+
+
+def error_frames_beyond_the_budget() -> None:
+    with Scenario("error_frames_beyond_the_budget", seconds=30.0) as s:
+        s.start()
+        s.running()
+        for _ in range(60):
+            sh("cansend", "vcan0", PASSIVE)
+
+
+def bus_off_is_reported() -> None:
+    with Scenario("bus_off_is_reported", seconds=30.0) as s:
+        s.start()
+        s.running()
+        sh("cansend", "vcan0", BUS_OFF)
+
+
+QDISC = ("root", "tbf", "burst", "32b", "limit", "160b", "rate")
+"""A bus that takes two frames and then one in 16 s; ten more wait, as with txqueuelen 10, then ENOBUFS."""
+
+
+def queue_is_full() -> None:
+    """The controller's card takes no more frames; when it does again, what was queued goes out."""
     if not Path("/sys/class/net/can1").exists():
         return
-    with Scenario("no_partner_fills_the_queue", drive="can1", controller="can0", seconds=30.0) as s:
+    with Scenario("queue_is_full", drive="can1", controller="can0", seconds=30.0) as s:
+        wire = subprocess.Popen(["candump", "-L", "can1"], stdout=(s.folder / "wire.log").open("w"))
+        s.start()
+        s.running()
+        sh("tc", "qdisc", "replace", "dev", "can0", *QDISC, "8bit")
+        s.run.wait()
+        (s.folder / "queued.txt").write_text(sh("tc", "-s", "qdisc", "show", "dev", "can0"))
+        (s.folder / "marks.json").write_text(json.dumps({"drained": time.time()}))
+        sh("tc", "qdisc", "change", "dev", "can0", *QDISC, "100mbit")
+        sh("cansend", "can0", "7E0#00")  # the queue is looked at again with the next frame
+        time.sleep(0.2)
+        sh("cansend", "can0", "080#01")  # what does the drive say of itself now
+        time.sleep(0.05)
+        wire.terminate()
+        wire.wait()
+        sh("tc", "qdisc", "del", "dev", "can0", "root")
+
+
+def no_partner() -> None:
+    if not Path("/sys/class/net/can1").exists():
+        return
+    with Scenario("no_partner", drive="can1", controller="can0", seconds=30.0) as s:
         s.start()
         s.running()
         sh("ip", "link", "set", "can1", "down")
@@ -269,7 +341,13 @@ def main() -> int:
         second_master,
         injected_and_ridden_through,
         injected_beyond_the_budget,
-        no_partner_fills_the_queue,
+        stale_counter_ridden_through,
+        stale_counters_beyond_the_budget,
+        error_frame_ridden_through,
+        error_frames_beyond_the_budget,
+        bus_off_is_reported,
+        queue_is_full,
+        no_partner,
     ]
     wanted = sys.argv[1:]
     begin = time.monotonic()
