@@ -7,7 +7,7 @@ controller whose feedback was lost does not wait, and lets the plant's time pass
 from __future__ import annotations
 
 import random
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
 from drivers.bus import Frame, Link
@@ -36,16 +36,22 @@ def nothing() -> None:
 
 
 class Injector:
-    """One frame fault at work: its random numbers and what it holds back."""
+    """One frame fault at work: its random numbers, what it holds back, how many frames it changed."""
 
     def __init__(self, fault: FrameFault, message: Message) -> None:
         self.fault, self.message = fault, message
+        self.acted = 0
         self._random = random.Random(fault.seed)
         self._held: Frame | None = None
         self._counter: float | None = None
 
     def apply(self, frame: Frame, t_ns: int) -> list[tuple[int, Frame]]:
         """What becomes of a frame: (due [ns of plant time], frame) in order."""
+        frames = self._apply(frame, t_ns)
+        self.acted += frames != [(t_ns, frame)]
+        return frames
+
+    def _apply(self, frame: Frame, t_ns: int) -> list[tuple[int, Frame]]:
         fault = self.fault
         if frame.can_id | frame.flags != self.message.send_id:
             return [(t_ns, frame)]
@@ -82,7 +88,10 @@ class Injector:
 
 
 class FaultyLink:
-    """A link that does to frames what a script says. ``now_ns`` is plant time."""
+    """A link that does to frames what a script says. ``now_ns`` is plant time.
+
+    ``acted`` counts by the fault's place in the script what each of them did.
+    """
 
     def __init__(
         self,
@@ -93,15 +102,19 @@ class FaultyLink:
         lockstep: bool,
         now_ns: Callable[[], int] = lambda: 0,
         lost_sync: Callable[[], None] = nothing,
+        acted: Counter[int] | None = None,
     ) -> None:
         self._link, self._lockstep = link, lockstep
         self.now_ns, self.lost_sync = now_ns, lost_sync
         sync = database.optional("SYNC")
         self._sync_id = sync.send_id if sync else None
-        self._silent = [fault for fault in faults if isinstance(fault, (BusOff, BrownOut))]
+        self._acted = Counter[int]() if acted is None else acted
+        self._silent = [
+            (place, fault) for place, fault in enumerate(faults) if isinstance(fault, (BusOff, BrownOut))
+        ]
         self._injectors = [
-            Injector(fault, database.message(fault.message))
-            for fault in faults
+            (place, Injector(fault, database.message(fault.message)))
+            for place, fault in enumerate(faults)
             if isinstance(fault, FrameFault)
         ]
         self._outgoing: list[tuple[int, Frame]] = []
@@ -113,14 +126,16 @@ class FaultyLink:
     def _through(self, frame: Frame) -> list[tuple[int, Frame]]:
         """A frame after all faults, with its due times."""
         frames = [(self.now_ns(), frame)]
-        for injector in self._injectors:
+        for place, injector in self._injectors:
             frames = [after for due, one in frames for after in injector.apply(one, due)]
+            self._acted[place] = injector.acted
         return frames
 
     def _cut(self) -> bool:
         """True while nothing passes; the beginning of a bus-off is told by an error frame."""
-        silent = [fault for fault in self._silent if fault.active(self.now_ns())]
-        if any(isinstance(fault, BusOff) for fault in silent) and not self._said_bus_off:
+        silent = [(place, fault) for place, fault in self._silent if fault.active(self.now_ns())]
+        self._acted.update(place for place, _ in silent)
+        if any(isinstance(fault, BusOff) for _, fault in silent) and not self._said_bus_off:
             self._said_bus_off = True
             self._link.send(BUS_OFF_ERROR, bytes(8))
         return bool(silent)

@@ -10,6 +10,7 @@ one turned by delta, the measured current the true one turned back.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from firmware_model.faults import (
     BrownOut,
     DcLink,
     EncoderSlip,
+    ExtraLoad,
     Fault,
     FrozenValue,
     Noise,
@@ -59,10 +61,10 @@ def advance_open_phase(p: Any, s: Any, theta: Any, dt_ns: int) -> None:
 
 
 class BlackBox:
-    """What really was at the motor: worst values, and until when the inverter gave voltage."""
+    """What really was at the motor: worst values, until when the inverter gave voltage, what faults did."""
 
-    def __init__(self, onset_ns: int) -> None:
-        self._onset_ns = onset_ns
+    def __init__(self, onset_ns: int, kinds: Sequence[str], acted: Counter[int]) -> None:
+        self._onset_ns, self._kinds, self._acted = onset_ns, kinds, acted
         self.last_on_ns = -1
         self.closed = False
         self.worst = {"w_rad_s": 0.0, "i_a": 0.0, "u_v": 0.0}
@@ -81,13 +83,19 @@ class BlackBox:
         """Worst values from the last fault on, end of the voltage [s], how the drive ended."""
         last_on_s = None if self.last_on_ns < 0 else self.last_on_ns * 1e-9
         state, error = State(int(s["state"])).name, ErrorCode(int(s["error"])).name
-        return {**self.worst, "voltage_until_s": last_on_s, "state": state, "error": error}
+        acted = [[kind, self._acted[place]] for place, kind in enumerate(self._kinds)]
+        return {**self.worst, "voltage_until_s": last_on_s, "state": state, "error": error, "acted": acted}
 
 
 class PlantFaults:
-    """Faults on one drive's records. :meth:`before` and :meth:`after` stand around each sample."""
+    """Faults on one drive's records. :meth:`before` and :meth:`after` stand around each sample.
 
-    def __init__(self, faults: Sequence[Fault], params: Record, echo_none: int) -> None:
+    ``acted`` counts by the fault's place in the script in how many samples each of them changed something.
+    """
+
+    def __init__(
+        self, faults: Sequence[Fault], params: Record, echo_none: int, acted: Counter[int] | None = None
+    ) -> None:
         self._faults, self._params, self._echo_none = faults, params, echo_none
         self._own = params.copy()
         self._theta = np.zeros(1)
@@ -95,14 +103,22 @@ class PlantFaults:
         self._off = False
         self._last_ns = 0
         onset_s = max((fault.at_s for fault in faults), default=0.0)
-        self.box = BlackBox(round(onset_s * 1e9))
+        self.acted = Counter[int]() if acted is None else acted
+        self.box = BlackBox(round(onset_s * 1e9), [fault.kind for fault in faults], self.acted)
 
     def advance(self, s: Any, dt_ns: int) -> None:
         """Move the plant on by dt_ns; with a phase open in short substeps."""
-        if any(isinstance(fault, PhaseLoss) and fault.active(int(s["t_ns"])) for fault in self._faults):
-            advance_open_phase(self._params[0], s, self._theta, dt_ns)
-        else:
+        open_phases = [
+            place
+            for place, fault in enumerate(self._faults)
+            if isinstance(fault, PhaseLoss) and fault.active(int(s["t_ns"]))
+        ]
+        if not open_phases:
             advance(self._params[0], s, dt_ns)
+            return
+        advance_open_phase(self._params[0], s, self._theta, dt_ns)
+        if s["x"][1] != 0.0 or s["x"][2] != 0.0:  # without current nobody can tell an open phase
+            self.acted.update(open_phases)
 
     def before(self, s: Any) -> bool:
         """Apply what acts on parameters and state; True when the drive has just booted again."""
@@ -111,15 +127,21 @@ class PlantFaults:
         for name in ("v_dc", "w_noise", "i_noise"):
             p[name] = own[name]
         off = False
-        for fault in self._faults:
+        for place, fault in enumerate(self._faults):
             if not fault.active(t_ns):
                 continue
+            changed = isinstance(fault, (OverTemperature, BrownOut))
             if isinstance(fault, DcLink):
                 p["v_dc"] = fault.v_dc_v
+                changed = p["v_dc"] != own["v_dc"]
             elif isinstance(fault, Noise):
                 p["w_noise"], p["i_noise"] = fault.w_noise_rad_s, fault.i_noise_a
+                changed = p["w_noise"] != own["w_noise"] or p["i_noise"] != own["i_noise"]
             elif isinstance(fault, OverTemperature):
                 s["temperature"] += fault.rate_k_s * (t_ns - self._last_ns) * 1e-9
+            elif isinstance(fault, ExtraLoad):
+                changed = fault.torque_n_m != 0.0
+            self.acted[place] += bool(changed)
             off |= isinstance(fault, BrownOut)
         self._last_ns = t_ns
         return self._supply(s, off)
@@ -143,6 +165,7 @@ class PlantFaults:
         for number, fault in enumerate(self._faults):
             if not fault.active(t_ns):
                 continue
+            before = self._seen(s, out)
             if isinstance(fault, EncoderSlip):
                 self._slip(s, out, math.radians(fault.angle_deg))
             elif isinstance(fault, Bias):
@@ -150,6 +173,12 @@ class PlantFaults:
             elif isinstance(fault, FrozenValue):
                 held = self._frozen.setdefault(number, tuple(float(out[name]) for name, _, _ in _MEASURED))
                 self._set(out, *held)
+            self.acted[number] += bool(self._seen(s, out) != before)
+
+    @staticmethod
+    def _seen(s: Any, out: Any) -> tuple[float, ...]:
+        """What :meth:`after` may change."""
+        return (s["u_q"], s["u_d"], *(out[name] for name, _, _ in _MEASURED))
 
     def _slip(self, s: Any, out: Any, delta: float) -> None:
         s["u_q"], s["u_d"] = turned(s["u_q"], s["u_d"], delta)

@@ -15,12 +15,14 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any, Literal
 
+import numpy as np
+
 from drivers.bus import Frame, Link
 from drivers.codec import Database
 from drivers.errors import LinkError
 from firmware_model.config import Record, Wire, new_sample, new_state
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
-from firmware_model.faulty_plant import PlantFaults
+from firmware_model.faulty_plant import PlantFaults, advance_open_phase
 from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.plant import State
@@ -42,6 +44,16 @@ def frames_of(database: Database, protocol: Protocol = "house", truth: bool = Tr
 def wire_of(database: Database, protocol: Protocol = "house") -> Wire:
     """Resolution and range of the measured signals."""
     return frames_of(database, protocol).wire
+
+
+def compile_kernels(params: Record, state: Record, *, faults: bool) -> None:
+    """Run every kernel of a plant once, those of faults too; ``state`` is spoiled."""
+    advance(params[0], state[0], 1000)
+    if faults:
+        advance_open_phase(params[0], state[0], np.zeros(1), 1000)
+    on_command(state[0], 0, 0, 0.0, 0.0)
+    on_load_command(state[0], 0.0)
+    on_sync(params[0], state[0], new_sample()[0])
 
 
 class Node:
@@ -86,11 +98,7 @@ class Node:
 
     def warm_up(self) -> None:
         """Compile the kernels on copies, before anything is on the bus."""
-        state = self._state.copy()
-        advance(self._params[0], state[0], 1000)
-        on_command(state[0], 0, 0, 0.0, 0.0)
-        on_load_command(state[0], 0.0)
-        on_sync(self._params[0], state[0], self._sample[0])
+        compile_kernels(self._params, self._state.copy(), faults=self._faults is not None)
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Serve the bus until ``stopped()``; boot-up message first, heartbeat every 100 ms."""

@@ -205,6 +205,7 @@ class LimitsTable(Table):
     following_error_rad_s: Positive | None = None
     following_error_s: Positive = 0.1
     i_d_max_a: Positive | None = None
+    open_phase_min_a: Positive | None = None
     trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
     guard_trip_ticks: Annotated[int, Field(ge=1)] = 200
     soft_start_s: NonNegative = 0.0

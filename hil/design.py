@@ -158,7 +158,8 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     for name, value in (values | _optional(limits)).items():
         p[name] = value
     if config.loop.shadow:  # command and reference are somebody else's, not ours
-        p["deviation_max"] = p["w_error_max"] = p["i_d_max"] = math.inf
+        for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):
+            p[name] = math.inf
     return p
 
 
@@ -180,6 +181,7 @@ def _optional(limits: LimitsTable) -> dict[str, float]:
         "i2t_max": or_never(limits.i2t_max_a2s),
         "energy_max": or_never(limits.energy_max_j),
         "i_d_max": or_never(limits.i_d_max_a),
+        "open_phase_min": or_never(limits.open_phase_min_a),
         "w_error_max": or_never(limits.following_error_rad_s),
         "deviation_max": or_never(limits.applied_deviation_max_v),
     }

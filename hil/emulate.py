@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import signal
+from collections import Counter
 from pathlib import Path
 
 from drivers.bus import Link, open_link
 from drivers.codec import Database
-from firmware_model.config import PlantConfig, build_params
+from firmware_model.config import PlantConfig, build_params, new_state
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults
-from firmware_model.node import Node, frames_of, wire_of
+from firmware_model.node import Node, compile_kernels, frames_of, wire_of
 from hil import realtime
 from hil.app import Overrides, bus_settings
 from hil.config import RunConfig, load_toml
@@ -32,7 +33,8 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     params = build_params(plant, wire_of(database, plant.protocol))
     link: Link = open_link(bus_settings(config))
     lockstep = config.loop.clock == "lockstep"
-    faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep) if plant.fault else None
+    acted = Counter[int]()
+    faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted) if plant.fault else None
     modulus = frames_of(database, plant.protocol).counter_modulus
     watched = plant.fault or plant.black_box
     node = Node(
@@ -44,7 +46,7 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         period_ns=config.loop.period_ns,
         truth=plant.truth,
         protocol=plant.protocol,
-        faults=PlantFaults(plant.fault, params, modulus - 1) if watched else None,
+        faults=PlantFaults(plant.fault, params, modulus - 1, acted) if watched else None,
     )
     if faulty is not None:
         faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
@@ -52,6 +54,13 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     motor = plant.motor.name or "inline"
     what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {motor}, {config.loop.clock}"
     return node, faulty or link, what
+
+
+def warm_up(path: Path, config: RunConfig) -> None:
+    """Compile the plant's kernels and those of its faults, for the processes forked from this one."""
+    plant, folder = load_plant(path, config)
+    params = build_params(plant, wire_of(Database(folder / plant.dbc, plant.node_id), plant.protocol))
+    compile_kernels(params, new_state(params, 0), faults=True)
 
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:

@@ -46,6 +46,7 @@ SAFETY_PARAMS: Final = np.dtype(
         ("w_error_max", "f8"),
         ("w_error_ticks", "i8"),
         ("i_d_max", "f8"),
+        ("open_phase_min", "f8"),
         ("counter_modulus", "i8"),
         ("shadow", "i8"),
         ("u_lsb", "f8"),
@@ -221,10 +222,14 @@ def voltage_limit(p: Any, s: Any) -> float:
 
 @jit
 def deviates(p: Any, s: Any, t: Any) -> bool:
-    """True when the drive applies another voltage than the last one sent, by more than allowed."""
+    """True when the drive applies another voltage than the last one sent, by more than allowed.
+
+    By how much a drive that limits the voltage itself is off is not known: with a limit given it deviates.
+    """
     dq = s["ua_q"] - s["u_q"]
     dd = s["ua_d"] - s["u_d"]
     far = dq * dq + dd * dd > p["deviation_max"] * p["deviation_max"]
+    far = far or (t["limited"] != 0 and p["deviation_max"] < math.inf)
     return bool(far and t["rx_flags"] & RxFlag.FRESH)
 
 

@@ -39,6 +39,7 @@ from hil.signals import DriveState
 
 RUN_TIMEOUT_S: Final = 60.0
 SAYS_NOTHING_S: Final = 20.0
+STEPPED: Final = "the wall clock was stepped"
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 1
 _fork = multiprocessing.get_context("fork")
@@ -96,18 +97,19 @@ def _redirected(write: int, errors: Path, target: Callable[..., None], args: tup
 
 def _control(setup: Setup, host: Any) -> None:
     """The controller's process."""
-    if isinstance(host, ClockStep):
-        _step_wall_clock(host)
+    stepped = _step_wall_clock(host) if isinstance(host, ClockStep) else lambda: False
     try:
         outcome = run(setup).outcome
     except (HilError, DriverError) as error:
         os.write(2, f"{error}\n".encode())
         raise SystemExit(2) from error
     os.write(1, f"{outcome.reason}\n".encode())
+    if stepped():
+        os.write(1, f"{STEPPED}\n".encode())
 
 
-def _step_wall_clock(fault: ClockStep) -> None:
-    """Let the wall clock of this process jump once; nothing else of the machine sees it."""
+def _step_wall_clock(fault: ClockStep) -> Callable[[], bool]:
+    """Let the wall clock of this process jump once; nothing else of the machine sees it. True once it has."""
     begin, time_s, time_ns = time.monotonic(), time.time, time.time_ns
 
     def step_s() -> float:
@@ -115,6 +117,7 @@ def _step_wall_clock(fault: ClockStep) -> None:
 
     setattr(time, "time", lambda: time_s() + step_s())  # noqa: B010 - a module's function, on purpose
     setattr(time, "time_ns", lambda: time_ns() + round(step_s() * 1e9))  # noqa: B010
+    return lambda: abs(time.time() - time_s() - fault.step_s) < 1.0 <= abs(fault.step_s)
 
 
 def own_network() -> None:
@@ -193,14 +196,21 @@ def writer_of(pid: int) -> int:
     raise HilError("the controller has no writer")
 
 
-def inject(host: Any, controller: Forked, setup: Setup, log: Callable[[], Path]) -> int:
-    """Put a fault on the running controller; its monotonic time [ns]."""
+def is_stopped(pid: int) -> bool:
+    """True while a process is stopped by a signal."""
+    stat = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    return stat.rsplit(")", 1)[1].split()[0] == "T"
+
+
+def inject(host: Any, controller: Forked, setup: Setup, log: Callable[[], Path]) -> tuple[int, bool]:
+    """Put a fault on the running controller: its monotonic time [ns]; False when it was seen not to act."""
     at_ns = wait_for_operation(setup) + round(host.at_s * 1e9)
     time.sleep(max(0.0, (at_ns - time.monotonic_ns()) * 1e-9))
-    onset_ns = time.monotonic_ns()
+    onset_ns, acted = time.monotonic_ns(), True
     if isinstance(host, Stall):
         controller.end(signal.SIGSTOP)
         time.sleep(host.for_ms * 1e-3)
+        acted = is_stopped(controller.pid)
         controller.end(signal.SIGCONT)
     elif isinstance(host, WriterKilled):
         os.kill(writer_of(controller.pid), signal.SIGKILL)
@@ -209,7 +219,10 @@ def inject(host: Any, controller: Forked, setup: Setup, log: Callable[[], Path])
         resource.prlimit(writer_of(controller.pid), resource.RLIMIT_FSIZE, (size, size))
     elif isinstance(host, InterfaceDown):
         set_loopback(False)
-    return onset_ns
+        if host.for_ms is not None:
+            time.sleep(host.for_ms * 1e-3)
+            set_loopback(True)
+    return onset_ns, acted
 
 
 def run_row(path: Path, matrix: Matrix, row: Row, folder: Path) -> Result:
@@ -231,18 +244,20 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
         f"log.folder={json.dumps(str(folder))}",
     )
     overrides = Overrides(settings=(*matrix.settings(row), *own, 'log.name="run"'))
-    setup, onset_ns = load_setup(path, overrides), None
+    setup, onset_ns, acted = load_setup(path, overrides), None, True
     with emulator(path, overrides, matrix.plant_settings(row), folder / "emulator.txt") as said:
         controller = Forked(folder / "controller.txt", _control, setup, row.host)
         try:
             if row.host is not None:
-                onset_ns = inject(row.host, controller, setup, lambda: folder / "run.mcap")
+                onset_ns, acted = inject(row.host, controller, setup, lambda: folder / "run.mcap")
             if controller.wait(RUN_TIMEOUT_S) is None:
                 result.why.append(f"the controller did not end in {RUN_TIMEOUT_S:g} s")
         finally:
             controller.end(signal.SIGKILL)
             controller.wait(10.0)
-        ended = controller.rest().strip()
+        ended, _, more = controller.rest().strip().partition("\n")
+    if isinstance(row.host, ClockStep):
+        acted = more == STEPPED
     if not ended.isdecimal():
         result.why.append("the controller died: " + (folder / "controller.txt").read_text(encoding="utf-8"))
     log = open_log(folder / "run.mcap")
@@ -252,7 +267,8 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
         onset_s = (onset_ns - int(log.ticks["t_ns"][0])) * 1e-9
     command = setup.database.message("COMMAND", "VoltageQ", "VoltageD")
     reader = command.reader("VoltageQ", "VoltageD")
-    evidence = Evidence(log, black_box(said), int(ended) if ended.isdecimal() else None, onset_s)
+    reason = int(ended) if ended.isdecimal() else None
+    evidence = Evidence(log, black_box(said), reason, onset_s, row.host, acted)
     judge(result, row.expect, evidence, setup.config.limits.u_max_v, reader, command.can_id)
     verdict = replay_log(log)
     result.replay = verdict.verdict

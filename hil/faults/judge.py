@@ -9,13 +9,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from hil.faults.matrix import Expect
+from hil.faults.matrix import Expect, Stall
 from hil.log.reader import Log
 from hil.signals import DriveState, Reason, TickArray
 
 AS_EXPECTED, NOT_EXPECTED = "as expected", "not as expected"
 SETTLED_TICKS: Final = 50
 """Over these last ticks before the planned stop a run that rode through must hold its speed."""
+STALL_SLACK_MS: Final = 1.0
+"""A loop that is stopped in its sleep notices so much less of a stall: its period at most."""
 ReadCommand = Callable[[bytes], tuple[float, ...]]
 
 
@@ -53,12 +55,17 @@ class Result:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What a run left: log, black box of the drive, Reason that the controller ended with, onset."""
+    """What a run left: log, black box of the drive, Reason that the controller ended with, onset.
+
+    ``host``: the fault of the host, ``host_acted``: False when it was seen not to act.
+    """
 
     log: Log
     box: dict[str, Any]
     ended: int | None
     onset_s: float
+    host: Any = None
+    host_acted: bool = True
 
 
 def faulty_stop(ticks: TickArray) -> int | None:
@@ -95,6 +102,7 @@ def judge(
         _judge_ride(result, expect, ticks)
     else:
         _judge_stop(result, expect, ticks, t_s, Reason(reason), box)
+    _judge_faults(result, evidence)
     _judge_limits(result, expect, u_max)
     _judge_log(result, expect, log)
     _judge_frames(result, log, command_id, read_command)
@@ -140,6 +148,24 @@ def _judge_ride(result: Result, expect: Expect, ticks: TickArray) -> None:
         result.why.append(f"speed off by {off:.2f} rad/s in the end")
 
 
+def _judge_faults(result: Result, evidence: Evidence) -> None:
+    """A fault that did nothing proves nothing, whatever came of the run."""
+    idle = [kind for kind, times in evidence.box["acted"] if not times]
+    host, ticks = evidence.host, evidence.log.ticks
+    if host is not None and not evidence.host_acted:
+        idle.append(host.kind)
+    elif isinstance(host, Stall) and silence_ms(ticks) < host.for_ms - STALL_SLACK_MS:
+        idle.append(f"{host.kind}, the loop was silent for {silence_ms(ticks):.1f} ms at most")
+    if idle:
+        result.why.append(f"did nothing: {', '.join(idle)}")
+
+
+def silence_ms(ticks: TickArray) -> float:
+    """Longest time between the wake-ups of two ticks that follow each other."""
+    woken_ns = ticks["t_ns"] + ticks["lateness_ns"]
+    return float(np.diff(woken_ns).max(initial=0)) * 1e-6
+
+
 def _judge_limits(result: Result, expect: Expect, u_max: float) -> None:
     bounds = (
         ("speed", result.w_worst_rad_s, expect.w_max_rad_s),
@@ -161,11 +187,15 @@ def _judge_log(result: Result, expect: Expect, log: Log) -> None:
 
 
 def _judge_frames(result: Result, log: Log, command_id: int, read_command: ReadCommand) -> None:
-    """No logged command frame carries voltage from the tick of the stop on."""
+    """No logged command frame carries voltage from the tick of the stop on.
+
+    That tick begins when the loop woke up for it: a late tick before it may send past its nominal time.
+    """
     reasons = log.ticks["reason"] != 0
     if not reasons.any():
         return
-    stop_ns = int(log.ticks["t_ns"][int(np.argmax(reasons))])
+    tick = log.ticks[int(np.argmax(reasons))]
+    stop_ns = int(tick["t_ns"]) + max(0, int(tick["lateness_ns"]))
     sent = [f for f in log.frames if not f.received and f.can_id == command_id and f.t_ns >= stop_ns]
     if any(any(value != 0.0 for value in read_command(frame.data)) for frame in sent):
         result.why.append("voltage was sent after the stop")

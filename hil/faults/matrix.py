@@ -51,10 +51,11 @@ class ClockStep(Table):
 
 
 class InterfaceDown(Table):
-    """The interface goes down (in a network namespace of the row's own)."""
+    """The interface goes down (in a network namespace of the row's own), for good or for ``for_ms``."""
 
     kind: Literal["interface-down"]
     at_s: NonNegative
+    for_ms: Annotated[int, Field(ge=1, le=5000)] | None = None
 
 
 Host = Annotated[Stall | WriterKilled | DiskFull | ClockStep | InterfaceDown, Field(discriminator="kind")]

@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
+from hil.emulate import warm_up
 from hil.faults.case import check_rows, run_row
 from hil.faults.judge import Result
 from hil.faults.matrix import Matrix, Row
@@ -30,7 +31,9 @@ def study(
     path: Path, matrix: Matrix, rows: list[Row], folder: Path, jobs: int, done: Callable[[Result], None]
 ) -> list[Result]:
     """Run rows; those in real time one after the other once the machine is free of the others."""
-    check_rows(path, matrix, rows).machine.warm_up()
+    setup = check_rows(path, matrix, rows)
+    setup.machine.warm_up()
+    warm_up(path, setup.config)
     results: dict[str, Result] = {}
     for realtime, side_by_side in ((False, jobs), (True, 1)):
         part = [row for row in rows if row.realtime == realtime]

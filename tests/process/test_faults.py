@@ -12,7 +12,7 @@ import pytest
 
 from hil.config import load_toml
 from hil.faults.case import run_row
-from hil.faults.matrix import Matrix
+from hil.faults.matrix import ClockStep, Matrix
 from hil.log.reader import open_log
 from hil.signals import FIELDS
 from tests.conftest import CONFIGS
@@ -63,13 +63,28 @@ def row_of(name: str, *more: str) -> Any:
     [
         ("frozen value while accelerating", ("feedback.frozen_ticks=10000",), "reason"),
         ("frame drop: no command reaches the drive", ("feedback.hold_ticks=1000",), "reason drive_fault"),
-        ("sensor bias: 25 A in i_d", ("limits.i_trip_a=22.0", "limits.i_d_max_a=30.0"), "reason drive_fault"),
+        ("sensor bias: 25 A in i_d", ("limits.trip_ticks=1000",), "reason drive_fault"),
+        ("phase loss at 2 N m", ("limits.open_phase_min_a=5.0",), "did not stop"),
         ("DC-link sag: 300 V", ("limits.v_dc_min_v=0.0",), "did not stop"),
     ],
 )
 def test_a_weakened_guard_fails_its_row(tmp_path: Path, name: str, weaker: tuple[str, ...], why: str) -> None:
     result = run_row(CONFIGS / "demo.toml", matrix(), row_of(name, *weaker), tmp_path / "run")
     assert result.verdict == "not as expected" and any(why in text for text in result.why), result.why
+
+
+IDLE = [
+    ({"fault": [{"kind": "drop", "at_s": 9.0}]}, "did nothing: drop"),
+    ({"fault": [{"kind": "dc-link", "at_s": 0.3, "v_dc_v": 540.0}]}, "did nothing: dc-link"),
+    ({"host": ClockStep(kind="clock-step", at_s=0.2, step_s=0.0)}, "did nothing: clock-step"),
+]
+
+
+@pytest.mark.parametrize(("changed", "why"), IDLE)
+def test_a_fault_that_does_nothing_fails_its_row(tmp_path: Path, changed: dict[str, Any], why: str) -> None:
+    row = row_of("no fault").model_copy(update=changed)
+    result = run_row(CONFIGS / "demo.toml", matrix(), row, tmp_path / "run")
+    assert why in result.why, result.why
 
 
 def test_a_row_is_the_same_to_the_bit_each_time(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,17 @@ def test_nothing_happens_outside_the_window() -> None:
     for counter in range(8):
         bench.feedback(counter)
     assert bench.counters() == [0, 1, 5, 6, 7]
+
+
+def test_what_a_fault_did_is_counted_by_its_place_in_the_script() -> None:
+    acted = Counter[int]()
+    script = faults({"kind": "drop", "at_s": 1.0}, {"kind": "duplicate", "at_s": 0.0, "for_s": 0.002})
+    bench = Bench()
+    bench.link = FaultyLink(bench.ends, DATABASE, script, lockstep=False, acted=acted)
+    bench.link.now_ns = lambda: bench.t_ns
+    for counter in range(4):
+        bench.feedback(counter)
+    assert (acted[0], acted[1]) == (0, 2)
 
 
 def test_a_share_is_drawn_from_the_seed() -> None:
@@ -227,6 +239,37 @@ def test_a_brown_out_boots_the_firmware_and_leaves_the_rotor_turning() -> None:
     assert booted == [False, False, False, True, False]
     assert (s["state"], s["u_q"], s["x"][1], s["echo"]) == (State.SWITCH_ON_DISABLED, 0.0, 0.0, 15)
     assert s["x"][0] == 50.0 and s["started"] == 1
+
+
+@pytest.mark.parametrize(
+    ("idle", "acting"),
+    [
+        ({"kind": "dc-link", "v_dc_v": 540.0}, {"kind": "dc-link", "v_dc_v": 539.0}),
+        ({"kind": "bias"}, {"kind": "bias", "i_q_a": 0.5}),
+        ({"kind": "encoder-slip", "angle_deg": 0.0}, {"kind": "encoder-slip", "angle_deg": 5.0}),
+        ({"kind": "load", "torque_n_m": 0.0}, {"kind": "load", "torque_n_m": 1.0}),
+        ({"kind": "noise", "w_noise_rad_s": 0.01, "i_noise_a": 0.002}, {"kind": "noise"}),
+    ],
+)
+def test_a_fault_of_the_plant_that_changes_nothing_has_not_acted(
+    idle: dict[str, Any], acting: dict[str, Any]
+) -> None:
+    s, out, own = plant({**idle, "at_s": 0.0}, {**acting, "at_s": 0.0})
+    out["w"], out["i_q"], out["i_d"], s["u_q"] = 50.0, 2.0, 0.0, 100.0
+    own.before(s)
+    own.after(s, out)
+    kind = idle["kind"]
+    assert own.box.as_dict(s)["acted"] == [[kind, 0], [kind, 1]]
+
+
+def test_an_open_phase_without_current_has_not_acted() -> None:
+    s, _, own = plant({"kind": "phase-loss", "at_s": 0.0})
+    s["state"] = State.SWITCH_ON_DISABLED
+    own.advance(s, 1_000_000)
+    assert own.acted[0] == 0
+    s["state"], s["u_q"] = State.OPERATION_ENABLED, 150.0
+    own.advance(s, 1_000_000)
+    assert own.acted[0] == 1
 
 
 def test_the_load_fault_is_one_more_load() -> None:

@@ -32,7 +32,7 @@ VALUES: dict[str, float] = {
     "trip_ticks": 3, "guard_trip_ticks": 5, "hold_ticks": 3, "quick_stop_ticks": 20, "error_budget": 8,
     "enable_ticks": 100, "max_gap": 20, "counter_modulus": 16, "u_lsb": 0.01, "T_L_lsb": 0.01, "J": 0.011,
     "frozen_ticks": 5, "repeat_ticks": 2**62, "frozen_du": 0.66, "w_error_max": math.inf, "w_error_ticks": 1,
-    "i_d_max": math.inf,
+    "i_d_max": math.inf, "open_phase_min": math.inf,
 }  # fmt: skip
 
 
@@ -138,6 +138,17 @@ def test_an_applied_voltage_that_deviates_trips_when_it_persists() -> None:
     guard.s["ua_q"], guard.s["ua_d"] = 17.0, 4.0  # 5 V away: allowed
     guard.ask(14.0)
     assert not guard.t["guard_flags"] & GuardFlag.APPLIED_DEVIATES
+
+
+@pytest.mark.parametrize(("deviation_max", "deviates"), [(5.0, True), (math.inf, False)])
+def test_a_drive_that_limits_the_voltage_deviates_when_there_is_a_limit(
+    deviation_max: float, deviates: bool
+) -> None:
+    guard = Guard(deviation_max=deviation_max)
+    guard.ask(14.0)
+    guard.s["ua_q"], guard.t["limited"] = 14.0, 1
+    guard.ask(14.0)
+    assert bool(guard.t["guard_flags"] & GuardFlag.APPLIED_DEVIATES) == deviates
 
 
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numpy scalars warn where compiled code does not

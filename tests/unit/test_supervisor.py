@@ -339,12 +339,29 @@ def test_a_speed_that_is_lost_stops_after_its_time() -> None:
 
 
 def test_a_d_current_that_is_mostly_large_stops() -> None:
-    bench = make("limits.i_d_max_a=2.0").enable()
+    own = ("limits.i_d_max_a=2.0", "limits.open_phase_min_a=100.0")
+    bench = make(*own).enable()
     swing = [4.0 * np.sin(0.4 * k) for k in range(600)]  # |i_d| > 2 A in two ticks of three
     reasons = [int(bench.step(i_d=i_d)["reason"]) for i_d in swing]
     assert Reason.CURRENT_UNCONTROLLED in reasons and reasons.index(Reason.CURRENT_UNCONTROLLED) > 200
-    bench = make("limits.i_d_max_a=2.0").enable()
+    bench = make(*own).enable()
     assert not any(int(bench.step(i_d=2.3 * np.sin(0.4 * k))["reason"]) for k in range(600))
+
+
+def test_an_open_phase_stops_at_light_load_too() -> None:
+    """The current stays on one stator axis while the rotor turns by 0.2 rad a tick."""
+
+    def reasons(amplitude: float, share: float = 1.0) -> list[int]:
+        bench = make("limits.i_d_max_a=2.0", "limits.open_phase_min_a=0.2").enable()
+        angles = [0.2 * k for k in range(600)]
+        return [
+            int(bench.step(i_q=amplitude * np.cos(a) + 1e-3 * a, i_d=share * amplitude * np.sin(a))["reason"])
+            for a in angles
+        ]
+
+    assert 100 < reasons(1.0).index(Reason.CURRENT_UNCONTROLLED) < 300
+    assert not any(reasons(0.19))  # too little to tell
+    assert not any(reasons(1.0, share=0.2))  # a d current that is small beside the q current
 
 
 def test_a_shadow_run_is_not_stopped_by_what_another_controller_does() -> None:
@@ -352,4 +369,4 @@ def test_a_shadow_run_is_not_stopped_by_what_another_controller_does() -> None:
 
     config = load_toml(CONFIGS / "demo.toml", RunConfig, ["loop.shadow=true", "limits.i_d_max_a=2.0"])
     p = safety_params(config, WIRE)[0]
-    assert np.isinf(p["w_error_max"]) and np.isinf(p["i_d_max"])
+    assert np.isinf(p["w_error_max"]) and np.isinf(p["i_d_max"]) and np.isinf(p["open_phase_min"])
