@@ -38,6 +38,7 @@ from hil.loop import Loop, Outcome, Plan, StopRequest
 from hil.ports import Drive
 from hil.progress import say, watching
 from hil.shadow import ShadowDrive
+from hil.showable import check_limits
 from hil.signals import Reason, new_ticks
 from hil.watch.registry import announced, own_entry, who_asked
 
@@ -140,6 +141,7 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
     binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
+    check_limits(str(path), config.limits, binding)
     wire = wire_facts(binding)
     return Setup(path, config, database, binding, wire, build(config, wire))
 
