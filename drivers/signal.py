@@ -38,6 +38,14 @@ class Signal:
         """Largest magnitude that the bits and the DBC's range allow, symmetric about 0."""
         return min(self.maximum, -self.minimum) if self.minimum < 0 else self.maximum
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """Smallest and largest value that the bits and the DBC's range can show."""
+        if self.is_float:
+            return self.minimum, self.maximum
+        low, high = sorted(raw * self.scale + self.offset for raw in self.raw_range())
+        return low, high
+
     def in_unit(self, unit: str, factor: float) -> Signal:
         """The same bits in another unit: one ``self.unit`` is ``factor`` of ``unit``."""
         return replace(

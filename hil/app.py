@@ -25,7 +25,7 @@ from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
-from drivers.mapping import MEASURED, DriveMap, house_map, map_from_table
+from drivers.mapping import MEASURED, RECEIVED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
 from hil import realtime
 from hil.clock import LockstepClock, RealClock
@@ -141,7 +141,8 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
     binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
-    check_limits(str(path), config.limits, binding)
+    shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
+    check_limits(str(path), config.limits, shown)
     wire = wire_facts(binding)
     return Setup(path, config, database, binding, wire, build(config, wire))
 
