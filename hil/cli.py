@@ -21,6 +21,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil report LOG [LOG ...]     one page of a run that works offline; several are compared
   hil info LOG, recover LOG    what is in a log; rewrite a damaged one
   hil export LOG -o FILE       ticks as Parquet, CSV, MAT, MF4; frames as candump, ASC, BLF
+  hil import REC -o LOG        a recording of the bus as a log to replay and report
   hil play LOG -c vcan0        recorded frames back on a bus with their timing
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil faults [CONFIG]          every fault against the running loop, with a verdict on each

@@ -1,4 +1,4 @@
-"""``hil export``: a log in the formats of other tools."""
+"""``hil export`` and ``hil import``: a log in the formats of other tools, and the way back."""
 
 from __future__ import annotations
 
@@ -19,6 +19,17 @@ def register(commands: Commands) -> None:
     command.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
     command.add_argument("-o", "--output", type=Path, metavar="FILE", required=True)
     command.add_argument("--force", action="store_true", help="replace FILE when it exists")
+    command = commands.add(
+        "import",
+        cmd_import,
+        "Write REC, a recording of the bus (candump .log, .blf, .asc, .mf4), as a log of CONFIG's controller",
+    )
+    command.add_argument("recording", type=Path, metavar="REC", help="a recording of frames")
+    command.add_argument("-o", "--output", type=Path, metavar="LOG", required=True, help="an MCAP file")
+    command.add_argument("--config", type=Path, metavar="CONFIG", required=True, help="run configuration")
+    command.add_argument("--channel", metavar="NAME", help="the recording's channel, where it has several")
+    command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as hil run's")
+    command.add_argument("--force", action="store_true", help="replace LOG when it exists")
 
 
 def cmd_export(args: argparse.Namespace) -> int:
@@ -31,4 +42,19 @@ def cmd_export(args: argparse.Namespace) -> int:
         print_json(found)
     else:
         show(key_values("hil export", found))
+    return 0
+
+
+def cmd_import(args: argparse.Namespace) -> int:
+    """Write a recording as a log."""
+    from hil.convert.importing import import_recording
+    from hil.view import key_values, show
+
+    found = import_recording(
+        args.recording, args.output, args.config, tuple(args.set), channel=args.channel, force=args.force
+    ).as_dict()
+    if args.json:
+        print_json(found)
+    else:
+        show(key_values("hil import", found))
     return 0

@@ -1,0 +1,204 @@
+"""How the frames of a recording make up ticks: which belong to which, and when each tick was."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+FOLLOW_TICKS: Final = 1000
+EARLY_SHARE: Final = 10
+AHEAD: Final = 4
+MOST_NS: Final = 2**31 - 1
+
+
+class Heard(NamedTuple):
+    """One recorded frame. ``t_ns`` from the first on; ``can_id`` carries SocketCAN's flag bits."""
+
+    t_ns: int
+    can_id: int
+    received: bool
+    fd: bool
+    data: bytes
+
+
+class Roles(NamedTuple):
+    """Which identifiers play which part: ``sync`` is None where the drive sends by its own clock.
+
+    ``measuring``: the messages of a measurement, all of which make one; ``commands``: the controller's.
+    """
+
+    sync: int | None
+    measuring: frozenset[int]
+    commands: Collection[int]
+
+
+@dataclass(slots=True)
+class Period:
+    """The frames of one tick: ``late`` came before its SYNC, ``answers`` to it, then ``commands``.
+
+    ``t_ns``: when SYNC passed, or the measurement was complete; ``answered_ns``, ``sent_ns``: the last of
+    each, -1 for none. ``closed`` is False for the last one, which may be cut off.
+    """
+
+    t_ns: int
+    late: list[Heard] = field(default_factory=list)
+    answers: list[Heard] = field(default_factory=list)
+    commands: list[Heard] = field(default_factory=list)
+    answered_ns: int = -1
+    sent_ns: int = -1
+    closed: bool = True
+
+    def answer(self, frame: Heard) -> None:
+        """Take a frame of the drive."""
+        self.answers.append(frame)
+        self.answered_ns = frame.t_ns
+
+    def cut(self, timeout_ns: int) -> list[Heard]:
+        """Without a command: keep what came in time, return the rest."""
+        in_time = [frame for frame in self.answers if self.commands or frame.t_ns <= self.t_ns + timeout_ns]
+        rest, self.answers = self.answers[len(in_time) :], in_time
+        if rest:
+            self.answered_ns = in_time[-1].t_ns if in_time else -1
+        return rest
+
+    def command(self, frame: Heard) -> None:
+        """Take a frame of the controller."""
+        self.commands.append(frame)
+        self.sent_ns = frame.t_ns
+
+
+def periods(frames: Iterable[Heard], roles: Roles, timeout_ns: int) -> Iterator[Period]:
+    """The ticks that the frames make up."""
+    if roles.sync is None:
+        return _by_feedback(_with_foreign(frames, roles), roles)
+    return _by_sync(_with_foreign(frames, roles), roles, timeout_ns)
+
+
+def _with_foreign(frames: Iterable[Heard], roles: Roles) -> Iterator[tuple[Heard, bool]]:
+    """Each frame and whether the controller sent it.
+
+    A recording made by the controller's own side says so of its frames; a command that it *received* is then
+    somebody else's. One made by a listener received them all.
+    """
+    ours = {*roles.commands, roles.sync}
+    own_side: bool | None = None
+    for frame in frames:
+        own = frame.can_id in ours
+        if own and own_side is None:
+            own_side = not frame.received
+        yield frame, own and not (own_side and frame.received)
+
+
+def _by_sync(frames: Iterable[tuple[Heard, bool]], roles: Roles, timeout_ns: int) -> Iterator[Period]:
+    """A tick begins with SYNC; what the drive says after the tick's command is late for it.
+
+    Where no command was sent, it is late after the timeout. What came before the first SYNC is not the run's.
+    """
+    period: Period | None = None
+    late: list[Heard] = []
+    for frame, own in frames:
+        if own and frame.can_id == roles.sync:
+            if period is not None:
+                late = period.cut(timeout_ns) + late
+                yield period
+            period, late = Period(frame.t_ns, late if period is not None else []), []
+        elif period is None:
+            continue
+        elif own:
+            period.command(frame)
+        elif period.commands:
+            late.append(frame)
+        else:
+            period.answer(frame)
+    if period is not None:
+        period.cut(timeout_ns)
+        period.closed = False
+        yield period
+
+
+def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles) -> Iterator[Period]:
+    """A tick is a measurement that is complete, and the commands up to where the next one begins.
+
+    What else the drive says after it is read with the next, as the loop does that waits for feedback alone.
+    """
+    period, queued = Period(0), list[Heard]()
+    missing = set(roles.measuring)
+    for frame, own in frames:
+        measures = frame.can_id in roles.measuring
+        if not missing and measures and not own:
+            yield period
+            period, queued = Period(0, answers=queued), []
+            missing = set(roles.measuring)
+        if own:
+            if not missing:
+                period.command(frame)
+        elif not missing:
+            queued.append(frame)
+        else:
+            period.answer(frame)
+            missing.discard(frame.can_id)
+            period.t_ns = frame.t_ns
+    if not missing:
+        period.closed = False
+        yield period
+
+
+def with_ahead(found: Iterable[Period]) -> Iterator[tuple[Period, list[int]]]:
+    """Each period with the stamps of the few that follow it."""
+    window: deque[Period] = deque()
+    for period in found:
+        window.append(period)
+        if len(window) > AHEAD:
+            yield window.popleft(), [one.t_ns for one in window]
+    while window:
+        yield window.popleft(), [one.t_ns for one in window]
+
+
+class Grid:
+    """Deadlines for stamps: one a period from the first stamp on, whole periods skipped as the loop does.
+
+    The recorder's clock is not the loop's: the grid is set back at once by a stamp that comes early by more
+    than a tenth of a period, and forward each thousand ticks by the least lateness among them.
+    """
+
+    def __init__(self, period_ns: int, *, by_sync: bool) -> None:
+        self._period_ns, self._by_sync = period_ns, by_sync
+        self._start_ns = self._last_ns = 0
+        self._least_ns, self._left = MOST_NS, FOLLOW_TICKS
+        self.k = -1
+
+    def gap(self, t_ns: int, ahead: Iterable[int] = ()) -> int:
+        """Periods from the last tick to one that is stamped ``t_ns``.
+
+        A SYNC may come late although its tick was on time (the process was held up between the two). The
+        stamps ``ahead`` tell: none of them can come before its deadline.
+        """
+        if self.k < 0:
+            return 1
+        if self._by_sync:
+            deadline_ns = self._start_ns + (self.k + 1) * self._period_ns
+            gap = 1 + (t_ns - deadline_ns) // self._period_ns
+            for later, stamp_ns in enumerate(ahead, start=1):
+                since_ns = stamp_ns + self._period_ns // EARLY_SHARE - self._start_ns
+                gap = min(gap, since_ns // self._period_ns - later - self.k)
+            return max(1, gap)
+        return max(1, round((t_ns - self._last_ns) / self._period_ns))
+
+    def place(self, t_ns: int, gap: int) -> int:
+        """Take the tick; return its deadline [ns]."""
+        if self.k < 0:
+            self._start_ns, gap = t_ns, 1
+        self.k, self._last_ns = self.k + gap, t_ns
+        deadline_ns = self._start_ns + self.k * self._period_ns
+        self._follow(t_ns - deadline_ns)
+        return self._start_ns + self.k * self._period_ns
+
+    def _follow(self, lateness_ns: int) -> None:
+        if lateness_ns < -self._period_ns // EARLY_SHARE:
+            self._start_ns += lateness_ns
+        self._least_ns, self._left = min(self._least_ns, lateness_ns), self._left - 1
+        if self._left == 0:
+            self._start_ns += max(self._least_ns, 0)
+            self._least_ns, self._left = MOST_NS, FOLLOW_TICKS
