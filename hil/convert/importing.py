@@ -132,8 +132,9 @@ def _carry(setup: Setup, recording: Recording, part: Path, out: Path, why: str =
     commands = (THEIRS if run.shadow else OURS) + why
     with RunFile(part, _header(setup, recording, commands)) as file:
         output = Output(file)
+        loop = setup.config.loop
         passing = output.passing(itertools.chain([first], frames))
-        count = _ticks(run, output, periods(passing, run.roles, setup.config.loop.timeout_ns))
+        count = _ticks(run, output, periods(passing, run.roles, loop.timeout_ns, loop.period_ns))
         for _ in passing:
             pass  # what comes after the run is kept as frames
         _check(recording, run, count)

@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 FOLLOW_TICKS: Final = 1000
 EARLY_SHARE: Final = 10
 AHEAD: Final = 4
+MERGE_PERIODS: Final = 5
+"""So long after a command a measurement without one counts as skipped by the controller."""
 MOST_NS: Final = 2**31 - 1
 
 
@@ -69,10 +71,10 @@ class Period:
         self.sent_ns = frame.t_ns
 
 
-def periods(frames: Iterable[Heard], roles: Roles, timeout_ns: int) -> Iterator[Period]:
+def periods(frames: Iterable[Heard], roles: Roles, timeout_ns: int, period_ns: int) -> Iterator[Period]:
     """The ticks that the frames make up."""
     if roles.sync is None:
-        return _by_feedback(_with_foreign(frames, roles), roles)
+        return _by_feedback(_with_foreign(frames, roles), roles, period_ns)
     return _by_sync(_with_foreign(frames, roles), roles, timeout_ns)
 
 
@@ -118,29 +120,39 @@ def _by_sync(frames: Iterable[tuple[Heard, bool]], roles: Roles, timeout_ns: int
         yield period
 
 
-def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles) -> Iterator[Period]:
+def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles, period_ns: int) -> Iterator[Period]:
     """A tick is a measurement that is complete, and the commands up to where the next one begins.
 
-    What else the drive says after it is read with the next, as the loop does that waits for feedback alone.
+    Of several measurements before a command the loop takes the newest and counts the others as skipped. A
+    command without a measurement is a tick whose wait was in vain. What else the drive says after it has
+    measured is read with the next tick.
     """
-    period, queued = Period(0), list[Heard]()
-    missing = set(roles.measuring)
+    period, queued, missing = Period(0), list[Heard](), set(roles.measuring)
+    commanded_ns = -MERGE_PERIODS * period_ns
     for frame, own in frames:
-        measures = frame.can_id in roles.measuring
-        if not missing and measures and not own:
+        measures = not own and frame.can_id in roles.measuring
+        again = own and any(frame.can_id == other.can_id for other in period.commands)
+        opened = not missing or bool(period.commands)
+        together = not period.commands and (
+            frame.t_ns - period.t_ns < period_ns // 2 or frame.t_ns - commanded_ns < MERGE_PERIODS * period_ns
+        )
+        if again or (measures and opened and not together):
             yield period
-            period, queued = Period(0, answers=queued), []
-            missing = set(roles.measuring)
+            period, queued, missing = Period(0, answers=queued), [], set(roles.measuring)
+            opened = False
         if own:
-            if not missing:
-                period.command(frame)
-        elif not missing:
+            period.command(frame)
+            commanded_ns = frame.t_ns
+            period.t_ns = frame.t_ns if missing else period.t_ns
+        elif opened and not measures:
             queued.append(frame)
         else:
+            period.answers += queued
+            queued = []
             period.answer(frame)
             missing.discard(frame.can_id)
             period.t_ns = frame.t_ns
-    if not missing:
+    if not missing or period.commands:
         period.closed = False
         yield period
 
@@ -163,34 +175,31 @@ class Grid:
     than a tenth of a period, and forward each thousand ticks by the least lateness among them.
     """
 
-    def __init__(self, period_ns: int, *, by_sync: bool) -> None:
-        self._period_ns, self._by_sync = period_ns, by_sync
-        self._start_ns = self._last_ns = 0
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._start_ns = 0
         self._least_ns, self._left = MOST_NS, FOLLOW_TICKS
         self.k = -1
 
-    def gap(self, t_ns: int, ahead: Iterable[int] = ()) -> int:
-        """Periods from the last tick to one that is stamped ``t_ns``.
+    def gap(self, t_ns: int, ahead: Iterable[int]) -> int:
+        """Periods from the last tick to one whose SYNC is stamped ``t_ns``.
 
         A SYNC may come late although its tick was on time (the process was held up between the two). The
         stamps ``ahead`` tell: none of them can come before its deadline.
         """
         if self.k < 0:
             return 1
-        if self._by_sync:
-            deadline_ns = self._start_ns + (self.k + 1) * self._period_ns
-            gap = 1 + (t_ns - deadline_ns) // self._period_ns
-            for later, stamp_ns in enumerate(ahead, start=1):
-                since_ns = stamp_ns + self._period_ns // EARLY_SHARE - self._start_ns
-                gap = min(gap, since_ns // self._period_ns - later - self.k)
-            return max(1, gap)
-        return max(1, round((t_ns - self._last_ns) / self._period_ns))
+        gap = (t_ns - self._start_ns) // self._period_ns - self.k
+        for later, stamp_ns in enumerate(ahead, start=1):
+            since_ns = stamp_ns + self._period_ns // EARLY_SHARE - self._start_ns
+            gap = min(gap, since_ns // self._period_ns - later - self.k)
+        return max(1, gap)
 
     def place(self, t_ns: int, gap: int) -> int:
         """Take the tick; return its deadline [ns]."""
         if self.k < 0:
             self._start_ns, gap = t_ns, 1
-        self.k, self._last_ns = self.k + gap, t_ns
+        self.k += gap
         deadline_ns = self._start_ns + self.k * self._period_ns
         self._follow(t_ns - deadline_ns)
         return self._start_ns + self.k * self._period_ns

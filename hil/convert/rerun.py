@@ -81,27 +81,42 @@ class Run:
         self._watch = CommandWatch(setup.binding) if self.shadow else None
         self._drive = ShadowDrive(self._client, self._watch.applied) if self._watch else self._client
         self._machine, self.ticks = setup.machine.fresh(), new_ticks()
-        self._grid = Grid(config.loop.period_ns, by_sync=self.roles.sync is not None)
+        self._tick = self.ticks[0]  # one object for all: the client binds itself to it
+        self._grid = Grid(config.loop.period_ns)
         self._asked = int(Request.ARM)
         self.fresh = self.skipped = 0
 
     def take(self, period: Period, ahead: list[int]) -> None:
         """Run the tick of a period; ``ahead``: stamps of those that follow. Raises NotOursError."""
-        tick = self.ticks[0]
-        tick["rx_flags"] = 0
-        if self.roles.sync is not None:
+        self._tick["rx_flags"] = 0
+        if self.roles.sync is None:
+            gap = self._newest(period)
+        else:
             self.tape.lay(period.late)
-            self._client.sync(tick)
-        self.tape.lay(period.answers)
-        self._drive.receive(tick, FAR_NS)
-        self.fresh += bool(int(tick["rx_flags"]) & RxFlag.FRESH)
-        gap = self._compute(period, ahead)
+            self._client.sync(self._tick)
+            self.tape.lay(period.answers)
+            self._drive.receive(self._tick, FAR_NS)
+            gap = self._grid.gap(period.t_ns, ahead)
+        self.fresh += bool(int(self._tick["rx_flags"]) & RxFlag.FRESH)
+        gap = self._compute(period, gap)
         self.skipped += gap - 1
         self._stamp(period, gap)
 
-    def _compute(self, period: Period, ahead: list[int]) -> int:
+    def _newest(self, period: Period) -> int:
+        """Take measurements as the loop does that waits for them: the newest counts, others are skipped."""
+        tick, heard = self._tick, 0
+        self.tape.lay(period.answers)
+        self._drive.receive(tick, FAR_NS)
+        while int(tick["rx_flags"]) & RxFlag.FRESH:
+            heard += 1
+            tick["rx_flags"] = int(tick["rx_flags"]) & ~int(RxFlag.FRESH)
+            self._drive.receive(tick, FAR_NS)
+        if heard:
+            tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.FRESH)
+        return heard if heard and self._grid.k >= 0 else 1
+
+    def _compute(self, period: Period, gap: int) -> int:
         """Run the controller; return the gap that the tick has."""
-        gap = self._grid.gap(period.t_ns, ahead)
         if self._watch is None:
             return self._guess(period, gap)
         self._step(gap, int(Request.ARM))
@@ -131,23 +146,27 @@ class Run:
         raise NotOursError(f"at {period.t_ns * 1e-9:.6f} s this controller sends something else")
 
     def _sends(self, period: Period) -> bool:
-        """Whether the tick's command is the recorded one; after the last one's come those of the stop."""
-        self.tape.sent.clear()
-        if self.ticks["send"][0]:
-            self._client.send(self.ticks[0])
-        recorded = [(frame.can_id, frame.data) for frame in period.commands]
+        """Whether the tick's command is the recorded one; after the last come those that stop the drive."""
         sent = self.tape.sent
-        return recorded == sent or (self.over and recorded[: len(sent)] == sent)
+        sent.clear()
+        if self._tick["send"]:
+            self._client.send(self._tick)
+        own, recorded = len(sent), [(frame.can_id, frame.data) for frame in period.commands]
+        if recorded == sent or not self.over:
+            return recorded == sent
+        self._client.stop()
+        stopping = [frame for frame in sent if frame[0] != self.roles.sync]
+        return len(recorded) >= own and recorded == stopping[: len(recorded)]
 
     @property
     def over(self) -> bool:
         """True once this controller has ended its run; a shadow goes on to the recording's end."""
-        tick = self.ticks[0]
+        tick = self._tick
         return not self.shadow and bool(tick["reason"] != 0 and int(tick["state"]) in ENDED)
 
     def _stamp(self, period: Period, gap: int) -> None:
         """The times of a tick, as far as the recording has them."""
-        tick, deadline_ns = self.ticks[0], self._grid.place(period.t_ns, gap)
+        tick, deadline_ns = self._tick, self._grid.place(period.t_ns, gap)
         tick["k"], tick["t_ns"], tick["gap"], tick["skipped"] = self._grid.k, deadline_ns, gap, gap - 1
         lateness_ns = period.t_ns - deadline_ns
         since = {"received_ns": period.answered_ns, "computed_ns": period.sent_ns, "sent_ns": period.sent_ns}
