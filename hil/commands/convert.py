@@ -14,10 +14,13 @@ def register(commands: Commands) -> None:
         "export",
         cmd_export,
         "Write LOG in another format, by the ending of FILE: ticks as .parquet .csv .mat .mf4, "
-        "frames as .log (candump) .asc .blf.",
+        "frames as .log (candump) .asc .blf, .mf4 with --frames.",
     )
     command.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
     command.add_argument("-o", "--output", type=Path, metavar="FILE", required=True)
+    command.add_argument(
+        "--frames", action="store_true", help="the frames, where FILE may hold either (.mf4)"
+    )
     command.add_argument("--force", action="store_true", help="replace FILE when it exists")
     command = commands.add(
         "import",
@@ -37,7 +40,7 @@ def cmd_export(args: argparse.Namespace) -> int:
     from hil.convert.export import export
     from hil.view import key_values, show
 
-    found = export(args.log, args.output, force=args.force).as_dict()
+    found = export(args.log, args.output, frames=args.frames, force=args.force).as_dict()
     if args.json:
         print_json(found)
     else:

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, Protocol
 import can
 import numpy as np
 
-from hil.convert.recordings import Candump, Vector
+from hil.convert.recordings import Candump, Mf4Recording, Vector
 from hil.convert.tables import CsvTable, Mf4Table, ParquetTable, write_mat
 from hil.log.errors import LogError
 from hil.log.reader import Log, read_blocks
@@ -33,6 +33,8 @@ class Sink(Protocol):
 
 
 Open = Callable[[Path, Log], Sink]
+FRAMES_OF: Final[dict[str, Open]] = {".mf4": Mf4Recording}
+"""Endings that may stand for the frames, too, when these are asked for."""
 FORMATS: Final[dict[str, tuple[Literal["ticks", "frames"], Open]]] = {
     ".parquet": ("ticks", ParquetTable),
     ".csv": ("ticks", CsvTable),
@@ -79,11 +81,16 @@ def replacing(out: Path, *, force: bool) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def export(source: Path, out: Path, *, force: bool = False) -> Exported:
-    """Write the log ``source`` as ``out``; the ending names the format. Raises LogError."""
+def export(source: Path, out: Path, *, frames: bool = False, force: bool = False) -> Exported:
+    """Write the log ``source`` as ``out``; the ending names the format. Raises LogError.
+
+    ``frames``: the frames, where the ending can stand for them and for ticks.
+    """
     kind = out.suffix.lower()
     if kind not in FORMATS and kind != MAT:
         raise LogError(f"{out}: the ending must be one of {' '.join(sorted([*FORMATS, MAT]))}")
+    if frames and kind not in FRAMES_OF and (kind == MAT or FORMATS[kind][0] != "frames"):
+        raise LogError(f"{out}: {kind} holds ticks; frames go to .log .asc .blf .mf4")
     if not source.is_file():
         raise LogError(f"{source}: no such file")
     with replacing(out, force=force) as part:
@@ -91,14 +98,14 @@ def export(source: Path, out: Path, *, force: bool = False) -> Exported:
             log = write_mat(part, source)
             holds, count = "ticks", len(log.ticks)
         else:
-            log, holds = Log(source, new_ticks(0)), FORMATS[kind][0]
-            count = _stream(log, part, kind)
+            log = Log(source, new_ticks(0))
+            holds, opened = ("frames", FRAMES_OF[kind]) if frames and kind in FRAMES_OF else FORMATS[kind]
+            count = _stream(log, part, holds, opened)
     return Exported(str(out), holds, count, out.stat().st_size, log.damage)
 
 
-def _stream(log: Log, part: Path, kind: str) -> int:
+def _stream(log: Log, part: Path, holds: str, opened: Open) -> int:
     """Slabs of the log into a sink. The sink is opened with the first, when the metadata are known."""
-    holds, opened = FORMATS[kind]
     sink, count = None, 0
     try:
         for slab in _slabs(log, holds):

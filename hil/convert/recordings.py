@@ -1,4 +1,4 @@
-"""Frames into recordings of the bus: candump, ASC and BLF. Time stamps are the log's, set off to its start.
+"""Frames into recordings of the bus: candump, ASC, BLF, MF4. Times are the log's, set off to its start.
 
 A frame of more than 8 bytes is a CAN FD frame; a log does not keep whether a shorter one was.
 """
@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import can
+import numpy as np
 
+from hil.convert.frame import need
 from hil.log.reader import Log
 from hil.log.schema import Records
 
@@ -97,3 +99,74 @@ class Vector(_Recording):
     def close(self) -> None:
         """Finish the file."""
         self._writer.stop()
+
+
+_GROUPS: Final = ("CAN_DataFrame", "CAN_RemoteFrame", "CAN_ErrorFrame")
+_FIELDS: Final = (
+    ("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"),
+    ("DataBytes", "u1", (64,)), ("Dir", "u1"), ("EDL", "u1"), ("BRS", "u1"), ("ESI", "u1"),
+)  # fmt: skip
+_DLC: Final = np.searchsorted([*range(9), 12, 16, 20, 24, 32, 48, 64], np.arange(65)).astype(np.uint8)
+
+
+def _group_dtype(group: str) -> np.dtype[np.void]:
+    """The structure of a group by ASAM's bus logging; a remote frame has neither data nor FD flags."""
+    fields = _FIELDS[:5] + _FIELDS[6:7] if group == "CAN_RemoteFrame" else _FIELDS
+    return np.dtype([(f"{group}.{name}", *rest) for name, *rest in fields])
+
+
+class Mf4Recording(_Recording):
+    """MF4 by ASAM's bus logging through asammdf: data, remote and error frames in a group each.
+
+    Whole blocks at once; python-can's own writer takes message by message.
+    """
+
+    def __init__(self, path: Path, log: Log) -> None:
+        super().__init__(log)
+        asammdf = need("asammdf", "MF4")
+        blocks = need("asammdf.blocks.v4_constants", "MF4")
+        source = need("asammdf.blocks.v4_blocks", "MF4").SourceInformation(
+            source_type=blocks.SOURCE_BUS, bus_type=blocks.BUS_TYPE_CAN
+        )
+        self._path, self._file = path, asammdf.MDF(version="4.10")
+        self._file.header.start_time = datetime.fromtimestamp(self._start_us * 1e-6).astimezone()
+        for group in _GROUPS:
+            samples = np.empty(0, _group_dtype(group))
+            self._file.append(asammdf.Signal(samples, np.empty(0), name=group, source=source))
+
+    def add(self, frames: Records) -> None:
+        """Append frames, each to its group."""
+        first_ns = self._first_ns = int(frames["t_ns"][0]) if self._first_ns is None else self._first_ns
+        can_id = frames["can_id"]
+        kind = np.where(can_id & ERROR, 2, np.where(can_id & REMOTE, 1, 0))
+        for index, group in enumerate(_GROUPS):
+            own = frames[kind == index]
+            if len(own):
+                seconds = (own["t_ns"] - first_ns) // 1000 * 1e-6
+                self._file.extend(index, [(seconds, None), (_group_rows(group, own), None)])
+
+    def close(self) -> None:
+        """Write the file."""
+        try:
+            self._file.save(self._path, overwrite=True)
+        finally:
+            self._file.close()
+
+
+def _group_rows(group: str, frames: Records) -> Records:
+    """Frames in the structure of their group."""
+    rows, fd = np.zeros(len(frames), _group_dtype(group)), frames["size"] > 8
+    values = {
+        "ID": frames["can_id"] & ID_MASK,
+        "IDE": (frames["can_id"] & EXTENDED) != 0,
+        "DLC": _DLC[frames["size"]],
+        "DataLength": frames["size"],
+        "DataBytes": frames["data"],
+        "Dir": frames["received"] == 0,
+        "EDL": fd,
+        "BRS": fd,
+    }
+    for name, column in values.items():
+        if f"{group}.{name}" in (rows.dtype.names or ()):
+            rows[f"{group}.{name}"] = column
+    return rows

@@ -106,13 +106,14 @@ READERS: dict[str, Callable[[Path], Any]] = {
     ".log": can.CanutilsLogReader,
     ".asc": can.ASCReader,
     ".blf": can.BLFReader,
+    ".mf4": can.MF4Reader,
 }
 
 
 @pytest.mark.parametrize("ending", list(READERS))
 def test_recordings_hold_every_frame_in_order(path: Path, tmp_path: Path, ending: str) -> None:
     out = tmp_path / f"a{ending}"
-    export(path, out)
+    assert export(path, out, frames=True).holds == "frames"
     with READERS[ending](out) as reader:
         seen = list(reader)
     assert len(seen) == len(FRAMES)

@@ -1,0 +1,213 @@
+"""A run's frames, exported, and imported again: the same ticks to the bit, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.app import Overrides, load_setup, run
+from hil.cli import main
+from hil.convert.export import export
+from hil.convert.importing import OURS, THEIRS, import_recording
+from hil.convert.periods import Grid, Heard, Period, Roles, periods, with_ahead
+from hil.demo import emulator_process
+from hil.log.errors import LogError
+from hil.log.reader import open_log
+from hil.replay import replay
+from hil.signals import FIELDS, INPUTS
+from tests.conftest import CONFIGS
+
+pytestmark = pytest.mark.process
+
+NOT_ON_THE_WIRE = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns"}
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A run: its config, what it was run with, its log."""
+
+    config: Path
+    settings: tuple[str, ...]
+    log: Path
+
+
+def ran(folder: Path, name: str, channel: str, *more: str) -> Ran:
+    shutil.copytree(CONFIGS, folder / "configs")
+    settings = (
+        f'bus.channel="{channel}"', f'log.folder="{folder / "logs"}"', "realtime.lock_memory=false",
+        "feedback.hold_ticks=150", "feedback.quick_stop_ticks=200", "loop.max_gap_ticks=64", *more,
+    )  # fmt: skip
+    path, overrides = folder / "configs" / name, Overrides(settings=settings)
+    with emulator_process(path, overrides, ("firmware.watchdog_ms=400.0",)):
+        return Ran(path, settings, Path(run(load_setup(path, overrides)).log))
+
+
+@pytest.fixture(scope="module")
+def steady(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """A second in lockstep, where stamps are deadlines."""
+    more = ('loop.clock="lockstep"', "loop.duration_s=1.0", "reference.at_s=0.1")
+    return ran(tmp_path_factory.mktemp("steady"), "demo.toml", "import-steady", *more)
+
+
+def differing(log: Path, other: Path) -> set[str]:
+    a, b = open_log(log).ticks, open_log(other).ticks
+    assert len(a) == len(b) > 500
+    return {field.name for field in FIELDS if a[field.name].tobytes() != b[field.name].tobytes()}
+
+
+@pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
+def test_there_and_back_is_the_same_in_every_field(steady: Ran, tmp_path: Path, ending: str) -> None:
+    recording, back = tmp_path / f"a{ending}", tmp_path / "back.mcap"
+    export(steady.log, recording, frames=True)
+    found = import_recording(recording, back, steady.config, steady.settings)
+    assert found.commands == OURS and found.ended == "stop_requested" and found.damage is None
+    assert differing(steady.log, back) == set()
+    assert replay(back).verdict == "same"
+    frames, again = open_log(steady.log).frames, open_log(back).frames
+    assert [(f.received, f.can_id, f.data) for f in frames] == [(f.received, f.can_id, f.data) for f in again]
+
+
+@pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
+def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name: str) -> None:
+    """Lateness, skipped periods and late feedback of a busy host included; with SYNC and without."""
+    one = ran(tmp_path, name, f"import-{name}", "loop.duration_s=1.5")
+    export(one.log, tmp_path / "a.log")
+    found = import_recording(tmp_path / "a.log", tmp_path / "back.mcap", one.config, one.settings)
+    assert found.commands == OURS, found
+    assert differing(one.log, tmp_path / "back.mcap") <= NOT_ON_THE_WIRE
+    assert replay(tmp_path / "back.mcap").verdict == "same"
+
+
+def test_another_controllers_commands_are_open_loop(steady: Ran, tmp_path: Path, capsys: Any) -> None:
+    export(steady.log, tmp_path / "a.log")
+    back, other = tmp_path / "back.mcap", (*steady.settings, "controller.speed_pole_rad_s=25.0")
+    found = import_recording(tmp_path / "a.log", back, steady.config, other)
+    assert found.commands.startswith(THEIRS) and "sends something else" in found.commands
+    assert replay(back).verdict == "same"
+    a, b = open_log(steady.log).ticks, open_log(back).ticks
+    for name in set(INPUTS) - {"request", "u_q_seen", "u_d_seen", "w_ref", "dw_ref"}:
+        assert a[name].tobytes() == b[name][: len(a)].tobytes(), name
+    echoed = a["drive_state"] == 4
+    applied = np.array(
+        [a["u_q"][a["counter"] == c][0] if (a["counter"] == c).any() else 0 for c in range(16)]
+    )
+    assert echoed.sum() > 900 and len(applied) == 16
+    rows = np.nonzero(echoed)[0]
+    assert np.array_equal(b["u_q_seen"][rows[1:]], a["u_q"][rows[1:] - 1]), (
+        "applied from now on: the last sent"
+    )
+    assert (b["send"] == 0).all()
+    assert main(["report", str(back), "-o", str(tmp_path / "r.html"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"][0]["replay"]["verdict"] == "same"
+
+
+Edit = Callable[[list[str]], list[str]]
+BAD: dict[str, tuple[Edit, str]] = {
+    "no feedback": (lambda rows: [row for row in rows if " 181#" not in row], "no valid feedback.*181"),
+    "other identifiers": (lambda rows: [row.replace(" 080#", " 090#") for row in rows], "SYNC 80; seen:.*90"),
+    "time goes back": (lambda rows: rows[300:] + rows[:300], "time goes back by 1.0"),
+    "two channels": (lambda rows: [*rows[:50], *(r.replace("can0", "can1") for r in rows[50:])], "--channel"),
+    "empty": (lambda rows: [], "has no frames"),
+    "noise": (lambda rows: ["\x00\xff no frame\n"], "can't be read on after frame 0"),
+}
+
+
+@pytest.mark.parametrize("case", list(BAD))
+def test_what_is_refused_names_the_trouble_and_leaves_nothing(steady: Ran, tmp_path: Path, case: str) -> None:
+    edit, words = BAD[case]
+    export(steady.log, tmp_path / "a.log")
+    rows = (tmp_path / "a.log").read_text().splitlines(keepends=True)
+    (tmp_path / "b.log").write_text("".join(edit(rows)))
+    with pytest.raises(LogError, match=words):
+        import_recording(tmp_path / "b.log", tmp_path / "back.mcap", steady.config, steady.settings)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.log", "b.log"]
+
+
+@pytest.mark.parametrize("ending", [".log", ".blf"])
+def test_a_recording_cut_off_counts_as_far_as_it_goes(steady: Ran, tmp_path: Path, ending: str) -> None:
+    export(steady.log, tmp_path / f"a{ending}")
+    raw = (tmp_path / f"a{ending}").read_bytes()
+    (tmp_path / f"b{ending}").write_bytes(raw[: len(raw) * 6 // 10])
+    back = tmp_path / "back.mcap"
+    found = import_recording(tmp_path / f"b{ending}", back, steady.config, steady.settings)
+    assert 100 < found.ticks < 1004 and found.commands == OURS and found.ended == "the recording ends here"
+    a, b = open_log(steady.log).ticks, open_log(back).ticks
+    assert all(a[f.name][: len(b)].tobytes() == b[f.name].tobytes() for f in FIELDS)
+    assert replay(back).verdict == "same"
+
+
+def test_the_command_refuses_in_one_line(steady: Ran, tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "a.txt").write_text("x")
+    words = [
+        "import",
+        str(tmp_path / "a.txt"),
+        "-o",
+        str(tmp_path / "b.mcap"),
+        "--config",
+        str(steady.config),
+    ]
+    assert main(words) == 2
+    assert ".blf" in capsys.readouterr().err
+
+
+MS = 1_000_000
+ROLES = Roles(0x80, frozenset({0x181}), {0x201})
+CYCLIC = Roles(None, frozenset({0x181}), {0x201})
+
+
+def heard(*rows: tuple[float, int]) -> list[Heard]:
+    return [Heard(round(t * MS), can_id, can_id == 0x181, False, b"") for t, can_id in rows]
+
+
+def shape(found: list[Period]) -> list[tuple[int, int, int]]:
+    return [(len(p.late), len(p.answers), len(p.commands)) for p in found]
+
+
+def test_feedback_after_the_command_is_late_for_the_next_tick() -> None:
+    rows = heard((0, 0x80), (0.9, 0x201), (0.95, 0x181), (1, 0x80), (1.1, 0x181), (1.2, 0x201), (2, 0x80))
+    assert shape(list(periods(rows, ROLES, MS // 2, MS))) == [(0, 0, 1), (1, 1, 1), (0, 0, 0)]
+    assert shape(list(periods(heard((0, 0x80), (0.9, 0x181), (1, 0x80)), ROLES, MS // 2, MS)))[0] == (0, 0, 0)
+
+
+def test_a_cyclic_drive_whose_measurement_got_no_command() -> None:
+    rows = [(0, 0x181), (0.1, 0x201), (1, 0x181), (2, 0x181), (2.1, 0x201), (3, 0x181), (3.1, 0x201)]
+    assert shape(list(periods(heard(*rows), CYCLIC, MS, MS))) == [(0, 1, 1), (0, 2, 1), (0, 1, 1)]
+    alone = list(periods(heard(*((t, 0x181) for t in range(5))), CYCLIC, MS, MS))
+    assert shape(alone) == [(0, 1, 0)] * 5, "a drive that nobody commands"
+
+
+@pytest.mark.parametrize(
+    ("stamps", "gaps"),
+    [
+        ([0, 1, 2, 3], [1, 1, 1, 1]),
+        ([0, 1, 3.2, 4, 5], [1, 1, 2, 1, 1]),
+        (
+            [0, 1, 3.1, 3.2, 4, 5],
+            [1, 1, 1, 1, 1, 1],
+        ),  # held up between waking and SYNC: no period was skipped
+        ([0, 1, 7.5, 8, 9], [1, 1, 6, 1, 1]),
+    ],
+)
+def test_gaps_by_the_stamps_of_sync(stamps: list[float], gaps: list[int]) -> None:
+    grid, found = Grid(MS), []
+    for period, ahead in with_ahead(Period(round(t * MS)) for t in stamps):
+        found.append(grid.gap(period.t_ns, ahead))
+        grid.place(period.t_ns, found[-1])
+    assert found == gaps
+
+
+@pytest.mark.parametrize("drift", [-300e-6, 300e-6])
+def test_a_recorders_clock_that_drifts_skips_nothing(drift: float) -> None:
+    grid, rng = Grid(MS), np.random.default_rng(3)
+    stamps = (np.arange(20_000) * MS * (1 + drift) + rng.exponential(0.03, 20_000) * MS).astype(int).tolist()
+    for period, ahead in with_ahead(Period(t) for t in stamps):
+        gap = grid.gap(period.t_ns, ahead)
+        assert gap == 1, f"seed 3, tick {grid.k}"
+        grid.place(period.t_ns, gap)
