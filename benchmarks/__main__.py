@@ -15,8 +15,8 @@ from typing import Any
 
 from hil.app import Overrides
 from hil.bench.machine import machine_facts
-from hil.bench.measure import QUICK, Length, phases, simulate_speed
-from hil.bench.processes import Stand, bare_run, hil_run, stand
+from hil.bench.measure import QUICK, Length, simulate_speed
+from hil.bench.processes import Stand, bare_run, hil_run, metered_run, stand
 from hil.demo import find_config
 from hil.view import key_values, show
 
@@ -43,7 +43,7 @@ def on_the_bus(one: Stand, seconds: float) -> dict[str, dict[str, Any]]:
     ticks = str(round(seconds * config.loop.rate_hz))
     usual = (sys.executable, "-m", "benchmarks.python_can_loop", *bus)
     return {
-        "hil run": {**run.said, "record_us": phases(run.ticks)["record"]},
+        "hil run": {**run.said, "record_us": metered_run(one, config.loop.rate_hz, seconds)["record"]},
         "bare loop": bare_run(one, config.loop.rate_hz, seconds).said,
         "python-can loop": peer(*usual, "--rate", str(config.loop.rate_hz), "--ticks", ticks),
     }

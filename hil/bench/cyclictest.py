@@ -26,7 +26,7 @@ class Anchor:
     note: str
 
 
-def cyclictest(period_ns: int, seconds: float, priority: int) -> Anchor:
+def cyclictest(period_ns: int, seconds: float, priority: int, core: int | None = None) -> Anchor:
     """Run it, under FIFO with that priority if granted, else as any process; a failure becomes a note."""
     program = shutil.which("cyclictest", path=os.pathsep.join((os.environ.get("PATH", ""), *OTHER_FOLDERS)))
     if program is None:
@@ -35,19 +35,20 @@ def cyclictest(period_ns: int, seconds: float, priority: int) -> Anchor:
     for policy, rank in (("fifo", priority), ("other", 0)):
         if policy == "fifo" and not priority:
             continue
-        lateness, problem = _run(program, period_ns, seconds, policy, rank)
+        lateness, problem = _run(program, period_ns, seconds, policy, rank, core)
         if lateness is not None:
             return Anchor(lateness, f"{policy}, priority {rank}")
     return Anchor(None, f"cyclictest failed: {problem}")
 
 
 def _run(
-    program: str, period_ns: int, seconds: float, policy: str, priority: int
+    program: str, period_ns: int, seconds: float, policy: str, priority: int, core: int | None
 ) -> tuple[Histogram | None, str]:
     """One run with its memory locked and the system's power management as it is."""
     loops = max(1, round(seconds * 1e9 / period_ns))
     command = [program, "-q", "-m", "--default-system", f"--policy={policy}", f"-p{priority}"]
     command += ["-t1", f"-i{max(1, period_ns // 1000)}", f"-l{loops}", f"-h{TOP_US}"]
+    command += [] if core is None else [f"-a{core}"]
     try:
         done = subprocess.run(
             command, cwd=Path("/"), capture_output=True, text=True, timeout=seconds + SLACK_S, check=False

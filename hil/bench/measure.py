@@ -13,13 +13,15 @@ from hil.app import Overrides, load_setup
 from hil.bench.cyclictest import Anchor, cyclictest
 from hil.bench.histogram import Histogram
 from hil.bench.machine import machine_facts
-from hil.bench.processes import BareRun, LoopRun, Stand, bare_run, hil_run, stand
+from hil.bench.pieces import guard_ns
+from hil.bench.processes import BareRun, LoopRun, Stand, bare_run, hil_run, metered_run, stand
 from hil.clock import RealClock
 from hil.replay import replay
 from hil.signals import TickArray
 from hil.simulate import simulate
 
 GOOD: Final = 0.999
+METERED_S: Final = 5.0
 RATES: Final = (1000, 2000, 2500, 4000, 5000, 6250, 8000, 10_000)
 Say = Callable[[str], None]
 
@@ -54,12 +56,16 @@ def bench(path: Path, overrides: Overrides, length: Length, say: Say) -> Bench:
         say(f"bench: {length.run_s:g} s at {loop.rate_hz} Hz beside the bare loop and cyclictest")
         floor = bare_run(one, loop.rate_hz, length.run_s)
         run = hil_run(one, loop.rate_hz, length.run_s)
-        anchor = cyclictest(loop.period_ns, length.run_s, one.setup.config.realtime.fifo_priority)
+        anchor = cyclictest(loop.period_ns, length.run_s, one.setup.config.realtime.fifo_priority, one.core)
+        plain = hil_run(one, loop.rate_hz, length.run_s, ("realtime.fifo_priority=0",))
+        tick_us = _tick_us(one, metered_run(one, loop.rate_hz, min(length.run_s, METERED_S)))
         replay_x = _replay_speed(run)
         rates = _rates(one, length, run, floor, say)
     say("bench: simulation")
     ours = Histogram.of(run.ticks["lateness_ns"].astype(np.int64))
     result = _result(run, floor, ours, anchor) | rates
+    result |= {"tick_us": tick_us, "record_us": tick_us["record"]}
+    result |= {"without_fifo": {"rate_hz": plain.rate_hz, "in_time": plain.in_time}}
     result |= {"replay_x_realtime": replay_x, "simulate_x_realtime": simulate_speed(path, overrides, length)}
     return Bench(result | {"machine": machine_facts()}, ours, anchor.lateness)
 
@@ -67,7 +73,6 @@ def bench(path: Path, overrides: Overrides, length: Length, say: Say) -> Bench:
 def _result(run: LoopRun, floor: BareRun, ours: Histogram, anchor: Anchor) -> dict[str, Any]:
     """What one run at the configured rate says."""
     processor, bare = float(run.said["processor_us"]), float(floor.said["processor_us"])
-    tick_us = phases(run.ticks)
     theirs = anchor.lateness
     return {
         "run_rate_hz": run.rate_hz,
@@ -78,8 +83,7 @@ def _result(run: LoopRun, floor: BareRun, ours: Histogram, anchor: Anchor) -> di
         "processor_us": processor,
         "bare_processor_us": bare,
         "processor_ratio": processor / bare,
-        "tick_us": tick_us,
-        "record_us": tick_us["record"],
+        "wall_us": phases(run.ticks),
         "lateness_us": ours.as_dict(),
         "cyclictest_us": theirs.as_dict() if theirs else None,
         "cyclictest": anchor.note,
@@ -106,6 +110,13 @@ def phases(ticks: TickArray) -> dict[str, float]:
         "record": ticks["recorded_ns"][1:].astype(np.int64) - sent[:-1],
     }
     return {name: float(np.median(value)) * 1e-3 if len(value) else 0.0 for name, value in parts.items()}
+
+
+def _tick_us(one: Stand, metered: dict[str, float]) -> dict[str, float]:
+    """Processor time a tick by phase [us]; the guard, which is compiled into the step, is told apart."""
+    guard = guard_ns(one.setup.machine) * 1e-3
+    both = metered.pop("control and guard")
+    return metered | {"control": both - guard, "guard": guard}
 
 
 def _rates(one: Stand, length: Length, run: LoopRun, floor: BareRun, say: Say) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,8 @@ class Stand:
     overrides: Overrides
     setup: Setup
     folder: Path
+    core: int | None
+    """Core of the loops, the drive has another one; None where there is but one."""
 
     def overrides_at(self, rate_hz: int, seconds: float, limited: bool = True) -> Overrides:
         """Settings of one run: its rate and length, patient with what a loaded machine does to it."""
@@ -45,6 +48,7 @@ class Stand:
         more += [f"loop.feedback_timeout_us={800_000 // rate_hz}", f'log.folder="{self.folder}"']
         more += ["feedback.hold_ticks=900", "feedback.quick_stop_ticks=1000", "loop.max_gap_ticks=64"]
         more += ["feedback.error_budget=10000"]
+        more += [] if self.core is None else [f"realtime.cpu={self.core}"]
         return replace(self.overrides, settings=(*self.overrides.settings, *more))
 
 
@@ -94,17 +98,47 @@ def stand(path: Path, overrides: Overrides) -> Iterator[Stand]:
             "name a bus without a real one (hil-local or vcan)"
         )
     with tempfile.TemporaryDirectory(prefix="hil-bench-") as folder:
-        one = Stand(path, overrides, setup, Path(folder))
-        with emulator_process(path, one.overrides_at(setup.config.loop.rate_hz, 1.0), CALM_PLANT):
+        loop_core, drive_core = two_cores(setup.config.realtime.cpu)
+        one = Stand(path, overrides, setup, Path(folder), loop_core)
+        with emulator_process(path, one.overrides_at(setup.config.loop.rate_hz, 1.0), CALM_PLANT) as pid:
+            if drive_core is not None:
+                os.sched_setaffinity(pid, {drive_core})
             yield one
 
 
-def hil_run(stand: Stand, rate_hz: int, seconds: float) -> LoopRun:
+def two_cores(wanted: int | None) -> tuple[int | None, int | None]:
+    """A core for the loops (the configured one, if any) and another for the drive, where there are two."""
+    cores = sorted(os.sched_getaffinity(0))
+    if len(cores) < 2:
+        return wanted, None
+    loop = cores[0] if wanted is None else wanted
+    return loop, next(core for core in reversed(cores) if core != loop)
+
+
+def _run_words(stand: Stand, rate_hz: int, seconds: float, more: tuple[str, ...] = ()) -> list[str]:
+    words = ["run", str(stand.path), "--json"]
+    for setting in (*stand.overrides_at(rate_hz, seconds).as_settings(), *more):
+        words += ["--set", setting]
+    return words
+
+
+def metered_run(stand: Stand, rate_hz: int, seconds: float) -> dict[str, float]:
+    """Processor time a tick [us] of each phase, from a run with :mod:`hil.bench.meter` in it."""
+    report = stand.folder / "metered.json"
+    words = ("-m", "hil.bench.meter", str(report), *_run_words(stand, rate_hz, seconds))
+    done = subprocess.run(
+        [sys.executable, *words], capture_output=True, text=True, timeout=seconds + SLACK_S, check=False
+    )
+    if not report.is_file():
+        raise HilError(f"metered run at {rate_hz} Hz: {done.stderr.strip()}")
+    found: dict[str, float] = json.loads(report.read_text(encoding="utf-8"))
+    return {name: ns * 1e-3 for name, ns in found.items()}
+
+
+def hil_run(stand: Stand, rate_hz: int, seconds: float, more: tuple[str, ...] = ()) -> LoopRun:
     """Run the controller as a process and read its log. Raises HilError when it refused or has lost ticks."""
     clock = RealClock()
-    command = [sys.executable, "-m", "hil.cli", "run", str(stand.path), "--json"]
-    for setting in stand.overrides_at(rate_hz, seconds).as_settings():
-        command += ["--set", setting]
+    command = [sys.executable, "-m", "hil.cli", *_run_words(stand, rate_hz, seconds, more)]
     begin_ns = clock.now_ns()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stderr is not None  # noqa: S101 - PIPE was asked for
@@ -145,9 +179,13 @@ def bare_run(stand: Stand, rate_hz: int, seconds: float) -> BareRun:
     command += [str(stand.setup.database.path), "--rate", str(rate_hz)]
     command += ["--ticks", str(round(rate_hz * seconds)), "--node", str(config.drive.node_id)]
     command += ["--fifo", str(config.realtime.fifo_priority)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, timeout=seconds * 10 + SLACK_S, check=False
-    )
-    if done.returncode != 0:
-        raise HilError(f"bare loop at {rate_hz} Hz: {done.stderr.strip()}")
-    return BareRun(rate_hz, json.loads(done.stdout))
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        if stand.core is not None:
+            os.sched_setaffinity(process.pid, {stand.core})
+        out, error = process.communicate(timeout=seconds * 10 + SLACK_S)
+    finally:
+        process.kill()
+    if process.returncode != 0:
+        raise HilError(f"bare loop at {rate_hz} Hz: {error.strip()}")
+    return BareRun(rate_hz, json.loads(out))

@@ -14,13 +14,19 @@ COMPARED: Final = {
     "processor_us": "lower",
     "bare_processor_us": "lower",
     "processor_ratio": "lower",
-    "tick_us.exchange": "lower",
+    "tick_us.receive": "lower",
+    "tick_us.check and decode": "lower",
     "tick_us.control": "lower",
+    "tick_us.guard": "lower",
+    "tick_us.encode": "lower",
     "tick_us.send": "lower",
+    "tick_us.sleep": "lower",
+    "wall_us.exchange": "lower",
     "record_us": "lower",
     "lateness_us.p50": "lower",
     "lateness_us.p999": "lower",
     "cyclictest_us.p999": "lower",
+    "without_fifo.in_time": "higher",
     "replay_x_realtime": "higher",
     "simulate_x_realtime": "higher",
     "start_s": "lower",
@@ -30,14 +36,17 @@ COMPARED: Final = {
 
 def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     """Names and texts, ratios first."""
-    tick, machine = result["tick_us"], result["machine"]
+    tick, wall, machine = result["tick_us"], result["wall_us"], result["machine"]
+    plain = result["without_fifo"]
     out = [
         ("processor time a tick", f"{result['processor_ratio']:.2f} x the bare loop's: " + _cost(result)),
         ("rate", _rate(result)),
         ("lateness at p99.9", _lateness_ratio(result)),
         ("lateness", _percentiles(result["lateness_us"])),
         ("cyclictest", _percentiles(result["cyclictest_us"]) + f" ({result['cyclictest']})"),
-        ("phases, median", ", ".join(f"{name} {value:.1f} us" for name, value in tick.items())),
+        ("processor time by phase", _phases(tick)),
+        ("phases as they pass, median", _phases(wall)),
+        ("without FIFO rights", f"{100 * plain['in_time']:.2f} % in time at {plain['rate_hz']} Hz"),
         ("replay", f"{result['replay_x_realtime']:.0f} x real time, from file to verdict"),
         ("simulation", f"{result['simulate_x_realtime']:.0f} simulated seconds a second, log included"),
         ("start to armed", f"{result['start_s']:.2f} s"),
@@ -45,6 +54,10 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     ]
     out += [("granted", _grants(result["grants"]))] if result["grants"] else []
     return [*out, ("machine", ", ".join(f"{name} {value}" for name, value in machine.items()))]
+
+
+def _phases(phases: dict[str, float]) -> str:
+    return ", ".join(f"{name} {us:.1f}" for name, us in phases.items()) + " us"
 
 
 def _cost(result: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from hil.bench.cyclictest import MISSING, cyclictest, parse
 from hil.bench.histogram import TOP_US, Histogram
 from hil.bench.machine import machine_facts, resident_kib
 from hil.bench.measure import highest, phases
+from hil.bench.meter import LOOP, Meter
 from hil.bench.view import ratios, read_result
 from hil.errors import HilError
 from hil.signals import new_ticks
@@ -119,3 +121,38 @@ def test_the_machine_is_described_in_json() -> None:
 
 def test_memory_of_a_process_that_has_gone_is_zero() -> None:
     assert resident_kib(2**22 + 1) == 0
+
+
+def test_a_phase_is_counted_without_the_phases_that_it_calls() -> None:
+    def spin() -> None:
+        end = time.thread_time_ns() + 2_000_000
+        while time.thread_time_ns() < end:
+            pass
+
+    meter = Meter([LOOP, "outer", "inner"])
+    inner = meter.wrap(2, spin)
+
+    def both() -> None:
+        spin()
+        inner()
+
+    meter.start()
+    meter.wrap(1, both)()
+    spin()
+    meter.stop()
+    assert meter.calls == [0, 1, 1] and meter.made == [1, 1, 0]
+    assert all(1_900_000 < ns < 20_000_000 for ns in meter.ns), meter.ns
+    assert meter.sums(100.0, 10.0)["outer"] == meter.ns[1] - 110.0
+
+
+def test_a_meter_goes_on_after_an_error_in_a_phase() -> None:
+    meter = Meter([LOOP, "fails"])
+
+    def fails() -> None:
+        raise OSError("the bus is down")
+
+    meter.start()
+    with pytest.raises(OSError, match="the bus is down"):
+        meter.wrap(1, fails)()
+    meter.stop()
+    assert meter.ns[0] > 0 and meter.calls[1] == 1

@@ -162,21 +162,13 @@ cd {shlex.quote(str(ROOT))}
 def warm_kernels() -> None:
     """Compile on the host what the machine will run: compiling there takes minutes."""
     with tempfile.TemporaryDirectory() as folder:
-        demo = [
-            sys.executable,
-            "-m",
-            "hil.cli",
-            "demo",
-            str(ROOT / "configs" / "demo.toml"),
-            "--lockstep",
-            "--json",
-        ]
-        short = ["--set", "loop.duration_s=0.2", "--set", f'log.folder="{folder}"']
-        done = subprocess.run(
-            [*demo, *short], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
-        )
-    if done.returncode != 0:
-        raise MachineError(f"the demo does not run on the host: {done.stderr.strip()}")
+        short = ("--set", "loop.duration_s=0.2", "--set", f'log.folder="{folder}"')
+        demo = ("hil.cli", "demo", str(ROOT / "configs" / "demo.toml"), "--lockstep", "--json", *short)
+        for module in (demo, ("tests.vm.guest.process",)):
+            command = [sys.executable, "-m", *module]
+            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+            if done.returncode != 0:
+                raise MachineError(f"{module[0]} does not run on the host: {done.stderr.strip()}")
 
 
 def run_in_machine(script: str, *, timeout_s: float = TIMEOUT_S, out: Path | None = None) -> Result:

@@ -16,70 +16,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from hil import cli
-from hil.config import RunConfig, load_toml
-from hil.emulate import make_node
+from tests.vm.guest import instructions as counted
+from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked, warm_up
 
 OUT = Path(os.environ["OUT"])
-SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
-CONFIG = "configs/vcan0.toml"
-# one processor serves every process of the machine: something stalls all of them for up to 30 ms now and then
-PATIENT = ("guardian.timeout_ms=200.0", "loop.max_gap_ticks=64")
 
 
 def sh(*command: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-class Forked:
-    """A hil command as a process of its own, forked after the imports, which take long in the machine."""
-
-    def __init__(self, output: Path, *words: str) -> None:
-        self.output, self._code = output, None
-        self.pid = os.fork()
-        if self.pid == 0:
-            self._become(words)
-
-    def _become(self, words: tuple[str, ...]) -> None:
-        code = 70
-        try:
-            target = os.open(self.output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-            os.dup2(target, 1)
-            code = cli.main(list(words))
-            sys.stdout.flush()
-        except SystemExit as error:
-            code = int(error.code or 0)
-        finally:
-            os._exit(code)
-
-    def poll(self) -> int | None:
-        if self._code is None:
-            pid, status = os.waitpid(self.pid, os.WNOHANG)
-            self._code = os.waitstatus_to_exitcode(status) if pid else None
-        return self._code
-
-    def wait(self) -> int:
-        while (code := self.poll()) is None:
-            time.sleep(0.01)
-        return code
-
-    def send_signal(self, number: int) -> None:
-        if self.poll() is None:
-            os.kill(self.pid, number)
-
-    def said(self) -> str:
-        return self.output.read_text() if self.output.exists() else ""
-
-
-def warm_up() -> None:
-    """Import everything and load the compiled kernels once, before any process is forked."""
-    from hil.app import Overrides, load_setup
-    from hil.simulate import simulate_ticks
-
-    simulate_ticks(load_setup(Path(CONFIG), Overrides(settings=("loop.duration_s=0.05",))))
-    node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
-    node[0].warm_up()
-    node[1].close()
 
 
 class Scenario:
@@ -106,9 +50,8 @@ class Scenario:
         self._candump = subprocess.Popen(["candump", "-L", self.controller], stdout=self.dump.open("w"))
         plant = [word for one in self.plant for word in ("--plant-set", one)]
         words = ("emulate", self.config, *self._bus(self.drive), *plant)
-        self.emulator = Forked(self.folder / "emulator.txt", *words)
-        while "ready" not in self.emulator.said() and self.emulator.poll() is None:
-            time.sleep(0.01)
+        self.emulator = Forked.hil(self.folder / "emulator.txt", *words)
+        self.emulator.until("ready")
         return self
 
     def _bus(self, channel: str) -> list[str]:
@@ -119,7 +62,7 @@ class Scenario:
         folder = ["--set", f'log.folder="{self.folder}"', "--set", f"loop.duration_s={self.seconds}"]
         arm = [] if self.controller.startswith("vcan") else ["--arm", "--yes"]
         words = ("run", self.config, *self._bus(self.controller), "--json", *arm, *folder)
-        self.run = Forked(self.folder / "run.json", *words)
+        self.run = Forked.hil(self.folder / "run.json", *words)
 
     def running(self) -> None:
         """Wait until commands are on the bus and the drive has been in operation for a while."""
@@ -283,9 +226,6 @@ def no_partner() -> None:
         sh("ip", "link", "set", "can1", "up")
 
 
-FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
-
-
 def vcan_fd() -> None:
     """One 64-byte frame each way."""
     with Scenario("vcan_fd", settings=FD, plant=('dbc="../drives/hil_pmsm_fd.dbc"',)) as s:
@@ -328,6 +268,11 @@ def by_hand() -> None:
         time.sleep(0.05)
 
 
+def instructions() -> None:
+    """What a tick costs, phase by phase."""
+    counted.measure(OUT)
+
+
 def main() -> int:
     scenarios: list[Callable[[], None]] = [
         vcan_two_processes,
@@ -348,6 +293,7 @@ def main() -> int:
         bus_off_is_reported,
         queue_is_full,
         no_partner,
+        instructions,
     ]
     wanted = sys.argv[1:]
     begin = time.monotonic()

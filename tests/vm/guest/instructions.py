@@ -1,0 +1,116 @@
+"""Instructions a tick, phase by phase: runs in the bench machine, where an instruction is a nanosecond.
+
+For each bus: a plain run of `hil run`, one with the meter of `hil bench` around the phases, and the bare loop
+against the same drive as the floor; on vcan0 a second plain run, to say how far two are apart. The thread's
+processor time is read, so that waiting counts for nothing. Leaves $OUT/instructions.json.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hil import cli
+from hil.bench.meter import run_metered
+from hil.bench.pieces import guard_ns
+from hil.config import RunConfig, load_toml
+from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked
+
+SECONDS = 0.5
+REPEATED = "vcan"
+BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
+    # name: controller's interface, drive's interface, settings, settings of the plant
+    "vcan": ("vcan0", "vcan0", (), ()),
+    "kvaser": ("can0", "can1", (), ()),
+    "fd": ("vcan0", "vcan0", FD, ('dbc="../drives/hil_pmsm_fd.dbc"',)),
+}
+CALM = ("load=[]", "truth=false")
+
+
+def flags(name: str, *values: str) -> list[str]:
+    """``name value`` for each value."""
+    return [word for value in values for word in (name, value)]
+
+
+def run_bare(interface: str, dbc: Path, ticks: int, priority: int) -> float:
+    """Instructions a tick of the bare loop."""
+    from drivers.bare import bare_loop, exchange_of, open_raw
+    from drivers.codec import Database
+
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    sockets = open_raw("socketcan", interface)
+    result = bare_loop(sockets, exchange_of(Database(dbc, 1)), 1_000_000, ticks)
+    return result.processor_us * 1e3
+
+
+class Bus:
+    """One bus of :data:`BUSES` with an emulated drive on it."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.own, self.drive, self.settings, plant = BUSES[name]
+        self.folder = SCRATCH / f"instructions-{name}"
+        self.folder.mkdir()
+        words = ("emulate", CONFIG, *self.words(self.drive), *flags("--plant-set", *CALM, *plant))
+        self.emulator = Forked.hil(self.folder / "emulator.txt", *words)
+
+    def words(self, interface: str) -> list[str]:
+        return ["-i", "socketcan", "-c", interface, *flags("--set", *PATIENT, *self.settings)]
+
+    def run_words(self) -> list[str]:
+        arm = [] if self.own.startswith("vcan") else ["--arm", "--yes"]
+        more = (f'log.folder="{self.folder}"', f"loop.duration_s={SECONDS}")
+        return ["run", CONFIG, *self.words(self.own), "--json", *arm, *flags("--set", *more)]
+
+    def result(self, job: Callable[[], int], name: str) -> str:
+        """What a process of its own printed."""
+        out = self.folder / name
+        code = Forked(out, job).wait()
+        if code:
+            raise RuntimeError(f"{self.name}: {name} ended with {code}: {out.read_text()[-300:]}")
+        return out.read_text()
+
+    def plain(self, name: str) -> float:
+        said = json.loads(self.result(lambda: cli.main(self.run_words()), name))
+        return float(said["processor_us"]) * 1e3
+
+    def phases(self) -> dict[str, float]:
+        report = self.folder / "phases.json"
+        self.result(lambda: run_metered(report, self.run_words()), "metered")
+        found: dict[str, float] = json.loads(report.read_text())
+        return found
+
+    def bare(self) -> float:
+        config = load_toml(Path(CONFIG), RunConfig, list(self.settings))
+        dbc, ticks = Path(CONFIG).parent / config.drive.dbc, round(SECONDS * 1000)
+
+        def job() -> int:
+            sys.stdout.write(str(run_bare(self.own, dbc, ticks, config.realtime.fifo_priority)))
+            return 0
+
+        return float(self.result(job, "bare"))
+
+    def measure(self) -> dict[str, Any]:
+        self.emulator.until("ready")
+        try:
+            runs = [self.plain(name) for name in ("first", "second")[: 1 + (self.name == REPEATED)]]
+            return {"runs": runs, "phases": self.phases(), "bare": self.bare()}
+        finally:
+            self.emulator.send_signal(signal.SIGTERM)
+            self.emulator.wait()
+
+
+def measure(out: Path) -> None:
+    """Everything; a bus that the host has not is left out. What is done is there at once."""
+    from hil.app import Overrides, load_setup
+
+    found: dict[str, Any] = {"guard": guard_ns(load_setup(Path(CONFIG), Overrides()).machine), "buses": {}}
+    for name, (own, *_) in BUSES.items():
+        if Path(f"/sys/class/net/{own}").exists():
+            found["buses"][name] = Bus(name).measure()
+            (out / "instructions.json").write_text(json.dumps(found))

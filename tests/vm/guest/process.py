@@ -1,0 +1,88 @@
+"""What every job in the bench machine starts with: hil commands as forked processes, kernels loaded once."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from hil import cli
+from hil.config import RunConfig, load_toml
+from hil.emulate import make_node
+
+SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
+CONFIG = "configs/vcan0.toml"
+FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
+# one processor serves every process of the machine: something stalls all of them for up to 30 ms now and then
+PATIENT = ("guardian.timeout_ms=200.0", "loop.max_gap_ticks=64")
+
+
+class Forked:
+    """A job as a process of its own, forked after the imports, which take long in the machine."""
+
+    def __init__(self, output: Path, job: Callable[[], int]) -> None:
+        self.output: Path = output
+        self._code: int | None = None
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._become(job)
+
+    @classmethod
+    def hil(cls, output: Path, *words: str) -> Forked:
+        """A hil command."""
+        return cls(output, lambda: cli.main(list(words)))
+
+    def _become(self, job: Callable[[], int]) -> None:
+        code = 70
+        try:
+            target = os.open(self.output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+            os.dup2(target, 1)
+            code = job()
+            sys.stdout.flush()
+        except SystemExit as error:
+            code = int(error.code or 0)
+        finally:
+            os._exit(code)
+
+    def poll(self) -> int | None:
+        if self._code is None:
+            pid, status = os.waitpid(self.pid, os.WNOHANG)
+            self._code = os.waitstatus_to_exitcode(status) if pid else None
+        return self._code
+
+    def wait(self) -> int:
+        while (code := self.poll()) is None:
+            time.sleep(0.01)
+        return code
+
+    def until(self, word: str) -> None:
+        """Wait until it has printed the word or ended."""
+        while word not in self.said() and self.poll() is None:
+            time.sleep(0.01)
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def said(self) -> str:
+        return self.output.read_text() if self.output.exists() else ""
+
+
+def warm_up() -> None:
+    """Import everything and load the compiled kernels once, before any process is forked."""
+    from hil.app import Overrides, load_setup
+    from hil.bench.pieces import guard_ns
+    from hil.simulate import simulate_ticks
+
+    setup = load_setup(Path(CONFIG), Overrides(settings=("loop.duration_s=0.05",)))
+    simulate_ticks(setup)
+    guard_ns(setup.machine, 1)
+    node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
+    node[0].warm_up()
+    node[1].close()
+
+
+if __name__ == "__main__":
+    warm_up()

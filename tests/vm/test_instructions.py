@@ -1,0 +1,50 @@
+"""The instruction gate: what a tick costs on SocketCAN, held to the budget in `budget.toml`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hil.bench.meter import LOOP, PHASES
+from tests.vm.guest.instructions import BUSES, REPEATED
+from tests.vm.instructions import apart, budget, excess, read, table_of
+
+pytestmark = [pytest.mark.vm, pytest.mark.timeout(1800)]
+
+
+@pytest.fixture(scope="module")
+def counted(socketcan: Path) -> dict[str, Any]:
+    left = socketcan / "instructions.json"
+    if not left.is_file():
+        pytest.fail(f"nothing was counted:\n{(socketcan / 'printed').read_text()}")
+    return read(left)
+
+
+def of_bus(counted: dict[str, Any], name: str) -> Any:
+    if name not in counted["buses"]:
+        pytest.skip(f"{name}: the host has no such interface")
+    return counted["buses"][name]
+
+
+@pytest.mark.parametrize("name", BUSES)
+def test_a_tick_is_within_its_budget(counted: dict[str, Any], name: str) -> None:
+    bus = of_bus(counted, name)
+    print(f"\n{name}\n{table_of(bus, budget()[name])}")
+    assert not (over := excess(name, bus)), over
+
+
+def test_two_runs_of_a_boot_cost_the_same(counted: dict[str, Any]) -> None:
+    """What makes the budget's 3 percent a bound and not noise."""
+    bus = of_bus(counted, REPEATED)
+    assert apart(bus) < 0.01 * max(bus["runs"]), bus["runs"]
+
+
+@pytest.mark.parametrize("name", BUSES)
+def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str) -> None:
+    """A phase that is nowhere has been renamed in the code: the meter's table has to follow."""
+    bus = of_bus(counted, name)
+    assert set(bus["phases"]) == {LOOP, *PHASES}
+    assert min(bus["phases"].values()) > 0, bus["phases"]
+    assert sum(bus["phases"].values()) == pytest.approx(max(bus["runs"]), rel=0.1), bus
