@@ -107,16 +107,16 @@ def install(meter: Meter) -> None:
 def run_metered(report: Path, words: list[str]) -> int:
     """Run `hil WORDS` with the meter in it; ``report`` gets each phase's processor time a tick [ns]."""
     from hil import cli
-    from hil.loop import Loop
+    from hil.loop import Loop, Outcome
 
     inner, outer = own_cost()
     meter, plain = Meter([LOOP, *PHASES]), Loop.run
     install(meter)
 
-    def run(loop: Loop) -> Any:
+    def run(self: Loop) -> Outcome:
         meter.start()
         try:
-            outcome = plain(loop)
+            outcome = plain(self)
         finally:
             meter.stop()
         sums = meter.sums(inner, outer)
