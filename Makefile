@@ -5,10 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/numba
 JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py tests/unit/test_drivers*.py) \
-    tests/unit/test_guard.py tests/unit/test_supervisor.py tests/unit/test_protocol.py tests/property
+    $(wildcard tests/unit/test_guard*.py tests/unit/test_supervisor*.py) tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash faults fuzz
+.PHONY: gallery demo test lint unit interpreted vm clean help crash faults fuzz guided mutants
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -48,8 +48,14 @@ faults: $(STAMP) ## the fault matrix, every row as expected
 crash: $(STAMP) ## kill every process of a run, again and again (KILLS=200 SEED=1)
 	$(BIN)/python -m tests.crash.kills --kills $(or $(KILLS),200) --seed $(or $(SEED),1)
 
-fuzz: $(STAMP) ## mutated files, frames and ticks; prints the inputs tried (SECONDS_EACH=10 SEED=1)
+fuzz: $(STAMP) ## mutated files, frames, commands and ticks; prints the inputs tried (SECONDS_EACH=10 SEED=1)
 	$(BIN)/python -m tests.fuzz.inputs --seconds $(or $(SECONDS_EACH),10) --seed $(or $(SEED),1)
+
+guided: $(STAMP) ## the same with coverage as the guide: needs pip install -e '.[fuzz]' (SECONDS_EACH=60 SEED=1)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.fuzz.guided --seconds $(or $(SECONDS_EACH),60) --seed $(or $(SEED),1)
+
+mutants: $(STAMP) ## change guard and supervisor, one place at a time: do their tests notice? (SAMPLE=0: all, SEED=1)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.mutation.mutants --sample $(or $(SAMPLE),0) --seed $(or $(SEED),1)
 
 clean: ## remove the virtual environment and caches
 	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache .hypothesis
