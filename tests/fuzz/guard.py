@@ -57,6 +57,7 @@ def scramble(guard: Guard, draw: Draw) -> None:
     on = not draw.one_in(6)
     guard.t["state"] = int(DriveState.OPERATION_ENABLED) if on else draw.below(8)
     guard.t["rx_flags"] = int(RxFlag.FRESH) if not draw.one_in(4) else draw.below(1 << 13)
+    guard.t["limited"] = draw.one_in(8)
     guard.s["run_ticks"] = draw.pick((10_000, 0, 1, 50, 99, 100))
     if draw.one_in(4):
         guard.s["ua_q"], guard.s["ua_d"] = draw.number(5.0, 50.0), draw.number(5.0, 50.0)
@@ -65,9 +66,14 @@ def scramble(guard: Guard, draw: Draw) -> None:
 
 
 def deviation(guard: Guard, before: Command) -> float:
-    """Distance of the applied voltage from the last one sent, 0 when nothing fresh tells it."""
+    """Distance of the applied voltage from the last one sent, 0 when nothing fresh tells it.
+
+    A drive that limits the voltage is off by more than any limit.
+    """
     if not int(guard.t["rx_flags"]) & RxFlag.FRESH:
         return 0.0
+    if guard.t["limited"] and math.isfinite(guard.p["deviation_max"][0]):
+        return 1e9
     return math.hypot(guard.s["ua_q"][0] - before[0], guard.s["ua_d"][0] - before[1])
 
 

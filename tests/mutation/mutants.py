@@ -149,7 +149,8 @@ def main() -> int:
     os.chdir(ROOT)
     hunt, begun = Hunt(chosen(args.sample, args.seed), args.workers), time.monotonic()
     skipped = "not random and not whatever"
-    pytest.main(["-q", "-x", "-p", "no:cacheprovider", "-k", skipped, *TESTS], [hunt])
+    quiet = ["-o", "addopts=", "-p", "no:terminal", "-p", "no:cacheprovider"]
+    pytest.main([*quiet, "-x", "-k", skipped, *TESTS], [hunt])
     if not hunt.green:
         print("the tests are not green without a mutant")
         return 1
