@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from hil.errors import HilError
 from hil.report.collect import Run, collect
-from hil.report.criteria import figures, judge
+from hil.report.criteria import figures, judge, open_loop
 from hil.report.page import page
 
 MOST_LOGS: Final = 8
@@ -59,6 +59,7 @@ def build(logs: Sequence[Path], out: Path, *, verify: bool = True) -> Report:
     names = [run.name for run in runs]
     for index, run in enumerate(runs):
         run.name = f"{run.name} ({index + 1})" if names.count(names[index]) > 1 else run.name
+        run.name += " (open loop)" if open_loop(run) else ""
     try:
         if out.suffix.lower() == ".png":
             from hil.report.picture import picture

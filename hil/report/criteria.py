@@ -98,9 +98,21 @@ def number(value: float | None, unit: str = "") -> str:
     return (f"{value:.0f}" if whole else f"{value:.4g}") + (f" {unit}" if unit else "")
 
 
+def open_loop(run: Run) -> str:
+    """What to know of a log that `hil replay --config -o` wrote; empty for a run."""
+    found = run.log.metadata.get("run", {})
+    if found.get("kind") != "what-if":
+        return ""
+    return (
+        "open loop: what another controller would have estimated and asked for over the measurements of "
+        f"{found.get('of', 'a log')}; the motor answered to the commands of that log, so speed and currents "
+        "are that run's"
+    )
+
+
 def limits(run: Run) -> dict[str, float]:
     """What the config demands: figure key to largest value; ``dip_max_rad_s`` limits ``dip_rad_s``."""
-    if run.config is None:
+    if run.config is None or open_loop(run):
         return {}
     given = run.config.criteria.model_dump(exclude_none=True)
     return {key.replace("_max", "", 1): float(value) for key, value in given.items()}
@@ -121,13 +133,14 @@ def _limit(run: Run, figure: Figure, most: float) -> Check:
 def _always(run: Run) -> list[Check]:
     """Ended as asked, log whole, nothing dropped, replay the same."""
     asked = run.ended in ("stop_requested", "quick_stop_requested")
+    ended: Outcome = "no data" if open_loop(run) else _outcome(asked)
     missing = run.totals.missing
     whole = run.log.damage is None and bool(run.log.result) and missing == 0
     found = run.log.damage or (f"{missing} records missing" if missing else "complete")
     verdict = run.verdict
     replayed: Outcome = {"same": "pass", "differs": "fail", "cannot": "no data"}[verdict.verdict]  # type: ignore[assignment]
     return [
-        Check("ended", _outcome(asked), run.ended.replace("_", " "), "stop requested"),
+        Check("ended", ended, run.ended.replace("_", " "), "stop requested"),
         Check("log", _outcome(whole), found if run.log.result else f"{found}; no result", "complete"),
         Check("replay", replayed, verdict_text(run), "same to the bit"),
     ]

@@ -77,10 +77,10 @@ PLOTS: Final = (
         "load", "Load torque: true and estimated", "N m",
         (_curve("T_L_true", "true"), _curve("T_L_hat", "estimate")),
     ),
-    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²", (_curve("d_hat_w", "d̂_w"),)),
+    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²", (_curve("d_hat_w", "d_hat_w"),)),
     Plot(
         "d_i", "Disturbance estimates, current channels", "A/s",
-        (_curve("d_hat_q", "d̂_q"), _curve("d_hat_d", "d̂_d", False)),
+        (_curve("d_hat_q", "d_hat_q"), _curve("d_hat_d", "d_hat_d", False)),
     ),
     Plot("filled", "Observer memory filled", "ticks", (_curve("filled", "filled"),), True),
     Plot(
@@ -135,3 +135,9 @@ def limit_lines(config: RunConfig | None, windows: tuple[int, ...]) -> dict[str,
         "v_dc": [(limits.v_dc_min_v, "min"), (limits.v_dc_max_v, "max")],
         "temperature": [(limits.temperature_max_c, "max")],
     }
+
+
+def limits_text(lines: list[tuple[float, str]]) -> str:
+    """The limits of a plot in words, for its heading: an axis need not reach to them."""
+    named = (name if "=" in name else f"{name} {value:g}" for value, name in lines if name)
+    return ", ".join(named)

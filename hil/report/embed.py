@@ -16,7 +16,7 @@ from hil.report.statistics import SPECTRUM_FIELDS
 
 MOST_EVENTS: Final = 500
 GAP_PERIODS: Final = 3.5  # a longer silence breaks the line
-FITTED: Final = ("current", "voltage_q", "voltage_d", "filled")  # the axis reaches to the limits
+FITTED: Final = ("voltage_q", "filled")  # the axis reaches to the limits
 
 
 def packed(values: npt.NDArray[Any]) -> str:

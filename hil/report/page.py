@@ -14,8 +14,17 @@ from importlib.resources import files
 from typing import Any, Final
 
 from hil.report.collect import Run
-from hil.report.criteria import FIGURES, SIGNS, Check, figures, judge, number, verdict_text
-from hil.report.curves import PLOTS
+from hil.report.criteria import (
+    FIGURES,
+    SIGNS,
+    Check,
+    figures,
+    judge,
+    number,
+    open_loop,
+    verdict_text,
+)
+from hil.report.curves import PLOTS, limits_text
 from hil.report.embed import MOST_EVENTS, charts, is_empty, report_data, script_json
 from hil.report.frames import id_text
 from hil.report.segments import Response
@@ -42,9 +51,9 @@ def _hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def table(head: Sequence[str], rows: Iterable[Row], numbers: bool = True) -> str:
-    """A table of cells that are HTML already; ``numbers``: all columns but the first are."""
-    kinds = [' class="n"' if numbers and column else "" for column in range(len(head))]
+def table(head: Sequence[str], rows: Iterable[Row], numbers: bool = True, texts: int = 1) -> str:
+    """A table of cells that are HTML already; ``numbers``: all columns but the first ``texts`` are."""
+    kinds = [' class="n"' if numbers and column >= texts else "" for column in range(len(head))]
     top = "".join(f"<th{kind}>{name}</th>" for kind, name in zip(kinds, head, strict=True))
     body = "".join(
         "<tr>" + "".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>"
@@ -84,7 +93,7 @@ def summary(runs: Sequence[Run]) -> str:
 
 def _notes(run: Run) -> str:
     """What is wrong with a log, said at the top."""
-    notes = [text for text in (run.log.damage, run.config_problem) if text]
+    notes = [text for text in (run.log.damage, run.config_problem, open_loop(run)) if text]
     if run.totals.ticks == 0:
         notes.append("the log has no ticks: there is nothing to draw")
     if run.totals.missing:
@@ -199,7 +208,11 @@ def traffic(run: Run) -> str:
             "counting every stuff bit that could be.</p>"
         )
     )
-    return table(head, rows) + text + ("<p>There are more identifiers.</p>" if run.frames.more_ids else "")
+    return (
+        table(head, rows, texts=3)
+        + text
+        + ("<p>There are more identifiers.</p>" if run.frames.more_ids else "")
+    )
 
 
 def events(run: Run) -> str:
@@ -224,11 +237,13 @@ def origin(run: Run) -> str:
 
 
 def _plots(runs: Sequence[Run]) -> str:
-    shown = [plot for plot in PLOTS if not is_empty(runs, plot)]
+    limits = runs[0].lines()
     return "".join(
         f'<div class="plot" id="plot-{plot.key}"><h3>{escape(plot.title)}'
-        f"{f' [{escape(plot.unit)}]' if plot.unit else ''}</h3></div>"
-        for plot in shown
+        f"{f' [{escape(plot.unit)}]' if plot.unit else ''}"
+        f'<span class="soft small">{escape(limits_text(limits.get(plot.key, [])))}</span></h3></div>'
+        for plot in PLOTS
+        if not is_empty(runs, plot)
     )
 
 
@@ -267,7 +282,8 @@ def page(runs: Sequence[Run]) -> str:
 <section>{summary(runs)}</section>
 <div id="bar"><button id="all">whole run</button><button id="back" disabled>back</button>
 <span id="range" class="small"></span><span class="hint soft small">drag across any plot to zoom all of them,
-double-click for the whole run; click a name under a plot to hide its curve</span></div>
+double-click for the whole run; click a name under a plot to hide its curve</span>
+<span id="near" class="small"></span></div>
 <section><h2>Curves</h2><div id="plots">{_plots(runs)}</div></section>
 <section><h2>Figures</h2>{metrics(runs)}</section>
 <section><h2>Step responses</h2>{_each(runs, responses)}</section>

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 
 from hil.report.collect import Run
 from hil.report.criteria import judge
-from hil.report.curves import KEYS, PLOTS, Plot
-from hil.report.embed import FITTED, is_empty
+from hil.report.curves import KEYS, PLOTS, Plot, limits_text
+from hil.report.embed import FITTED, MOST_EVENTS, is_empty
 
 COLOURS: Final = ("#0b62c4", "#d1570a", "#15803d", "#9333ea", "#b4235a", "#0e7c86", "#7a5c00", "#50555b")
 INCHES: Final = (12.0, 2.0)
@@ -58,10 +58,20 @@ def _draw(axis: Any, plot: Plot, runs: Sequence[Run]) -> None:
             _envelope(axis, plot, t, low[row], high[row], colour, label[:40])
     for value, _ in runs[0].lines().get(plot.key, []) if plot.key in FITTED else ():
         axis.axhline(value, color="#c4231c", linestyle="--", linewidth=0.7)
-    axis.set_title(f"{plot.title} [{plot.unit}]" if plot.unit else plot.title, loc="left", fontsize=8)
+    limits = limits_text(runs[0].lines().get(plot.key, []))
+    title = f"{plot.title} [{plot.unit}]" if plot.unit else plot.title
+    axis.set_title(f"{title}   {limits}".rstrip(), loc="left", fontsize=8)
     axis.set_xlabel("t [s]", fontsize=7)
     if plot.names:
         axis.set_yticks(range(len(plot.names)), plot.names, fontsize=6)
+        axis.set_ylim(-0.5, len(plot.names) - 0.5)
+    for event in runs[0].events(MOST_EVENTS):
+        axis.axvline(
+            event["t"],
+            color="#5b6570" if event["kind"] == "state" else "#c4231c",
+            linestyle=":",
+            linewidth=0.7,
+        )
     axis.legend(loc="best", fontsize=6, framealpha=0.7)
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from hil.app import Overrides, Setup, header_of, load_setup
+from hil.config import RunConfig, load_toml
 from hil.log.mcapfile import RunFile
 from hil.report.build import build
 from hil.signals import TickArray, new_ticks
 from hil.simulate import simulate, simulate_ticks
+from hil.whatif import what_if
 from tests.browser.chromium import Page
 from tests.conftest import CONFIGS
 
@@ -121,6 +123,42 @@ def test_runs_are_compared_in_one_page(page: Page, setup: Setup, ticks: TickArra
     text = page.evaluate("document.body.textContent")
     assert "second: w" in text and "second − first" in text
     assert "differs" in text or "same" in text
+    assert page.problems == []
+
+
+def test_what_another_controller_would_have_done_is_called_open_loop(
+    page: Page, setup: Setup, ticks: TickArray, tmp_path: Path
+) -> None:
+    log, other = written(tmp_path / "run.mcap", setup, ticks), tmp_path / "other.mcap"
+    path = CONFIGS / "demo.toml"
+    what_if(log, path, load_toml(path, RunConfig, ["observer.speed.delay_ms=40.0"]), other)
+    report = build([log, other], tmp_path / "both.html")
+    opened(page, report.path)
+    text = page.evaluate("document.body.textContent")
+    assert "other (open loop): estimate" in text and "run (open loop)" not in text
+    notes = page.evaluate("[...document.querySelectorAll('.note')].map(e => e.textContent)")
+    assert len(notes) == 1 and notes[0].startswith("open loop") and "of run.mcap" in notes[0]
+    own, others = (run["checks"] for run in report.as_dict()["runs"])
+    assert [c["name"] for c in others] == ["ended", "log", "replay"] and len(own) > 3
+    assert others[0]["outcome"] == "no data" and others[2]["outcome"] == "pass"  # it replays, too
+    assert page.problems == []
+
+
+def test_events_and_limits_are_told(page: Page, setup: Setup, ticks: TickArray, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with RunFile(path, header_of(setup, "run", "lockstep")) as file:
+        file.add_ticks(ticks)
+        file.add_event(int(ticks["t_ns"][3000]), 3000, "note", "half-time")
+        file.finish({"ended": "stop_requested", "ticks": len(ticks), "skipped": 0})
+    opened(page, build([path], tmp_path / "run.html", verify=False).path)
+    assert "i_max" in page.evaluate("document.querySelector('#plot-current h3').textContent")
+    assert "u_max" in page.evaluate("document.querySelector('#plot-voltage_d h3').textContent")
+    left, top, _, height = page.box("#plot-speed .u-over")
+    x = page.evaluate("hilReport.charts[0].u.valToPos(3.0, 'x')")
+    page.mouse("mouseMoved", left + x + 1, top + height / 2)
+    page.wait_for("document.querySelector('#near').textContent === '3 s note: half-time'")
+    page.mouse("mouseMoved", left + x + 40, top + height / 2)
+    page.wait_for("document.querySelector('#near').textContent === ''")
     assert page.problems == []
 
 

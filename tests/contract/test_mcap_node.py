@@ -1,20 +1,18 @@
 """Our files in @mcap/core, the reader that Foxglove and Lichtblick are built on: every tick, to the bit.
 
-Needs node, and a folder where `npm install @mcap/core fzstd` was run, named by HIL_NODE_MODULES (its
-node_modules). Skipped without; HIL_REQUIRE_NODE=1 makes that a failure.
+Needs node and the packages @mcap/core and fzstd, see tests/node.py. Skipped without.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from tests.logfiles import HEADER, some_frames, some_ticks, write_log
+from tests.node import MISSING, has_packages, node
 
 SCRIPT = """
 const {McapIndexedReader} = require("@mcap/core"), fzstd = require("fzstd");
@@ -47,24 +45,10 @@ const zstd = (data, size) => fzstd.decompress(data, new Uint8Array(Number(size))
 """
 
 
-def node(script: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a script; the packages are looked for where HIL_NODE_MODULES says."""
-    env = os.environ | {"NODE_PATH": os.environ.get("HIL_NODE_MODULES", "")}
-    return subprocess.run(
-        ["node", "-e", script, *words], capture_output=True, text=True, timeout=120, env=env, check=False
-    )
-
-
 @pytest.fixture(scope="module")
 def needs_node() -> None:
-    try:
-        missing = node("require('@mcap/core'); require('fzstd')").stderr.strip()
-    except FileNotFoundError:
-        missing = "there is no node"
-    if missing and os.environ.get("HIL_REQUIRE_NODE") == "1":
-        pytest.fail(missing)
-    if missing:
-        pytest.skip("node, @mcap/core and fzstd are not there: npm install them, set HIL_NODE_MODULES")
+    if not has_packages("@mcap/core", "fzstd"):
+        pytest.skip(MISSING)
 
 
 @pytest.mark.usefixtures("needs_node")

@@ -24,11 +24,32 @@ from hil.demo import emulator_process
 from hil.log.schema import TOPICS, file_descriptor_set
 from hil.signals import FIELDS, TICK, DriveState, ticks_from
 from tests.conftest import CONFIGS
+from tests.node import has_packages, node
 from tests.process.test_run import flags, hil
 from tests.process.test_watch import wait_for_run
 
 Settings = Callable[..., tuple[str, ...]]
 PROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
+
+SCRIPT = """
+const {FoxgloveClient} = require("@foxglove/ws-protocol"), WebSocket = require("ws");
+const socket = new WebSocket(process.argv[1], ["foxglove.sdk.v1"]);
+const client = new FoxgloveClient({ws: socket}), channels = {}, ticks = [];
+let subscription;
+const out = found => { console.log(JSON.stringify(found)); process.exit(); };
+client.on("error", error => out({error: String(error)}));
+client.on("serverInfo", info => { channels.info = info.name; });
+client.on("advertise", all => all.forEach(one => {
+  channels[one.topic] = [one.schemaName, one.encoding, one.schema];
+  if (one.topic === "/tick") subscription = client.subscribe(one.id);
+}));
+client.on("message", ({subscriptionId, timestamp, data}) => {
+  if (subscriptionId !== subscription) return;
+  const bytes = Buffer.from(data.buffer, data.byteOffset, data.byteLength);
+  ticks.push([String(timestamp), bytes.toString("base64")]);
+  if (ticks.length === 500) out({channels, ticks});
+});
+"""
 
 
 def fields_of(message: str) -> set[str]:
@@ -60,6 +81,20 @@ async def talk(url: str) -> tuple[dict[str, Any], dict[str, Any], dict[str, list
         return info, channels, got
 
 
+def check_what_foxgloves_client_got(found: dict[str, Any]) -> None:
+    """The JavaScript client of Foxglove: channels, schemas, times, ticks to the byte."""
+    schema = base64.b64encode(file_descriptor_set().SerializeToString()).decode()
+    assert "error" not in found, found
+    channels = found["channels"]
+    assert channels.pop("info") == "hil watch" and set(channels) == {"/tick", "/can/rx", "/can/tx", "/event"}
+    assert all(channels[topic] == [TOPICS[topic], "protobuf", schema] for topic in channels)
+    raw = [base64.b64decode(data) for _, data in found["ticks"]]
+    assert all(len(one) == TICK.itemsize for one in raw)
+    ticks = ticks_from(b"".join(raw))
+    assert [int(t) for t, _ in found["ticks"]] == ticks["t_ns"].tolist()
+    assert (ticks["k"][1:] > ticks["k"][:-1]).all()
+
+
 @pytest.mark.process
 def test_a_client_gets_the_schemas_and_ticks_of_the_log_files(
     configs: Path, settings: Settings, tmp_path: Path, channel: str, monkeypatch: pytest.MonkeyPatch
@@ -74,6 +109,8 @@ def test_a_client_gets_the_schemas_and_ticks_of_the_log_files(
             found = re.search(r"ws://127\.0\.0\.1:\d+", line := server.stderr.readline())
             assert found, line
             info, channels, got = asyncio.run(talk(found[0]))
+            if has_packages("@foxglove/ws-protocol", "ws"):
+                check_what_foxgloves_client_got(json.loads(node(SCRIPT, found[0]).stdout))
             process.terminate()
             process.wait(60)
             assert "the run has ended: stop_requested" in server.stderr.read()
@@ -109,8 +146,9 @@ def test_without_the_extra_it_is_one_clear_line() -> None:
     assert done.stderr == "hil: foxglove-sdk is not installed: pip install 'hil-drive[foxglove]'\n"
 
 
-def test_the_layout_of_lichtblick_and_foxglove_names_what_is_there() -> None:
-    layout = json.loads((CONFIGS / "layouts" / "lichtblick.json").read_text())
+@pytest.mark.parametrize("name", ["lichtblick", "lichtblick-live"])
+def test_the_layouts_of_lichtblick_and_foxglove_name_what_is_there(name: str) -> None:
+    layout = json.loads((CONFIGS / "layouts" / f"{name}.json").read_text())
     panels = layout["configById"]
     paths = [p["value"] for panel in panels.values() for p in panel.get("paths", [])]
     assert len(paths) > 12
@@ -120,6 +158,8 @@ def test_the_layout_of_lichtblick_and_foxglove_names_what_is_there() -> None:
     assert all(panel["topicPath"] in TOPICS for panel in panels.values() if "topicPath" in panel)
     placed = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(layout["layout"]))
     assert sorted(placed) == sorted(panels)
+    follow = {panel.get("followingViewWidth") for key, panel in panels.items() if key.startswith("Plot!")}
+    assert follow == ({10} if name.endswith("live") else {None})  # live: the last 10 s; a log: all of it
 
 
 def test_the_layout_of_plotjuggler_names_what_is_there() -> None:

@@ -64,8 +64,9 @@
     stroke: () => colour("soft"), grid: {stroke: () => colour("line"), width: 1},
     ticks: {stroke: () => colour("line"), width: 1}, font: "12px system-ui, sans-serif", ...more,
   });
-  const short = v => v == null ? "–" : Math.abs(v) >= 1e5 || (v !== 0 && Math.abs(v) < 1e-3)
-    ? v.toExponential(3) : String(+v.toPrecision(5));
+  const short = v => v == null ? "–" : v !== 0 && (Math.abs(v) >= 1e6 || Math.abs(v) < 1e-3)
+    ? v.toExponential(3).replace(/\.?0+e/, "e") : String(+v.toPrecision(6));
+  const shorts = (u, splits) => splits.map(v => v == null ? "" : short(v));
 
   function horizontalLines(u, lines) {
     const ctx = u.ctx, {left, top, width, height} = u.bbox;
@@ -83,18 +84,40 @@
     ctx.restore();
   }
 
-  function eventLines(u) {
-    const ctx = u.ctx, {left, top, width, height} = u.bbox;
+  // A line at each event; in the plot of the states its kind, too, where there is room.
+  function eventLines(u, named) {
+    const ctx = u.ctx, {left, top, width, height} = u.bbox, px = devicePixelRatio;
+    let free = -Infinity;
     ctx.save();
+    ctx.font = `${10 * px}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
     for (const run of runs) for (const event of run.events) {
       const x = u.valToPos(event.t, "x", true);
       if (!(x >= left && x <= left + width)) continue;
-      ctx.strokeStyle = colour(event.kind === "state" ? "soft" : "bad");
+      ctx.strokeStyle = ctx.fillStyle = colour(event.kind === "state" ? "soft" : "bad");
       ctx.globalAlpha = 0.6;
       ctx.setLineDash([2, 4]);
       ctx.beginPath(); ctx.moveTo(x, top); ctx.lineTo(x, top + height); ctx.stroke();
+      if (!named || x < free) continue;
+      free = x + 12 * px;
+      const after = x + 12 * px < left + width;
+      ctx.globalAlpha = 1;
+      ctx.translate(x + (after ? 10 : -3) * px, top + height - 6 * px); ctx.rotate(-Math.PI / 2);
+      ctx.fillText(event.kind, 0, 0);
+      ctx.rotate(Math.PI / 2); ctx.translate(-x - (after ? 10 : -3) * px, -top - height + 6 * px);
     }
     ctx.restore();
+  }
+
+  // What happened where the pointer is.
+  const nearText = document.getElementById("near");
+  function tellNear(u) {
+    const found = [];
+    for (const run of u.cursor.left >= 0 ? runs : []) for (const event of run.events) {
+      if (Math.abs(u.valToPos(event.t, "x") - u.cursor.left) < 5)
+        found.push(`${short(event.t)} s ${event.kind}: ${event.text}`);
+    }
+    nearText.textContent = found.slice(0, 3).join("; ") + (found.length > 3 ? `; and ${found.length - 3} more` : "");
   }
 
   function verticalRange(plot) {
@@ -147,9 +170,9 @@
       },
       scales: {x: {time: false, range: (u, min, max) => [min, max]}, y: {range: verticalRange(plot)}},
       axes: [
-        axis({values: (u, splits) => splits.map(short)}),
+        axis({values: shorts}),
         axis({size: plot.names.length ? 150 : 64, values: plot.names.length
-          ? (u, splits) => splits.map(s => plot.names[s] ?? "") : (u, splits) => splits.map(short),
+          ? (u, splits) => splits.map(s => plot.names[s] ?? "") : shorts,
           ...(plot.names.length ? {splits: () => plot.names.map((_, i) => i)} : {})}),
       ],
       series: [
@@ -161,7 +184,8 @@
         })),
       ],
       hooks: {
-        draw: [u => { eventLines(u); horizontalLines(u, plot.lines); }],
+        draw: [u => { eventLines(u, plot.key === "state"); horizontalLines(u, plot.lines); }],
+        setCursor: [tellNear],
         setSelect: [u => {
           if (u.select.width < 3) return;
           const min = u.posToVal(u.select.left, "x"), max = u.posToVal(u.select.left + u.select.width, "x");
@@ -186,7 +210,7 @@
         y: {distr: 3, range: (u, min, max) => max > 0
           ? [chart.steps ? 0.1 : 10 ** Math.floor(Math.log10(min)), 10 ** Math.ceil(Math.log10(max) + 0.01)] : [0.1, 10]},
       },
-      axes: [axis({label: chart.x, labelSize: 18, size: 34}), axis({size: 70, values: (u, s) => s.map(v => v == null ? "" : short(v))})],
+      axes: [axis({label: chart.x, labelSize: 18, size: 34, values: shorts}), axis({size: 70, values: shorts})],
       series: [
         {label: chart.x, value: (u, v) => short(v)},
         ...chart.curves.map(c => ({
