@@ -8,7 +8,7 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     $(wildcard tests/unit/test_guard*.py tests/unit/test_supervisor*.py) tests/unit/test_protocol.py tests/property
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash faults fuzz guided mutants
+.PHONY: gallery demo test lint unit interpreted vm clean help crash faults soak fuzz guided mutants
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -47,6 +47,9 @@ faults: $(STAMP) ## the fault matrix, every row as expected
 
 crash: $(STAMP) ## kill every process of a run, again and again (KILLS=200 SEED=1)
 	$(BIN)/python -m tests.crash.kills --kills $(or $(KILLS),200) --seed $(or $(SEED),1)
+
+soak: $(STAMP) ## a long run at 1 kHz: memory, descriptors, threads flat, no drops, replay (SECONDS=600)
+	$(BIN)/python -m tests.soak.run --seconds $(or $(SECONDS),600)
 
 fuzz: $(STAMP) ## mutated files, frames, commands and ticks; prints the inputs tried (SECONDS_EACH=10 SEED=1)
 	$(BIN)/python -m tests.fuzz.inputs --seconds $(or $(SECONDS_EACH),10) --seed $(or $(SEED),1)
