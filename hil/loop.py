@@ -19,6 +19,7 @@ Step = Callable[[TickArray], None]
 MAX_NS = 2**31 - 1
 NO_WAIT = 1
 """A deadline that has long passed: one feedback if it is there already."""
+COUNTER_JUMP = int(RxFlag.COUNTER_JUMP)
 QUEUE_MOST = 4096
 """Queued feedback that one tick takes; a flood can't hold it longer."""
 ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
@@ -160,29 +161,40 @@ class Loop:
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
         """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
 
-        Each feedback is one period of the drive's clock; lateness is then how much later it came than one
-        period after the last. Returns k and its deadline.
+        Each feedback is one period of the drive's clock, and so is each that is missing: k follows the time.
+        Lateness is how much later it came than it was due. Returns k and its deadline.
         """
         flags = self._cells.rx_flags
         plan, drive, fresh = self._plan, self._drive, int(RxFlag.FRESH)
+        if not k:
+            self._arrived_ns = self._clock.now_ns()
         wait_ns = plan.period_ns * 3 // 2
-        drive.receive(tick, self._clock.receive_deadline(self._clock.now_ns(), wait_ns))
+        drive.receive(tick, self._clock.receive_deadline(self._arrived_ns, wait_ns))
         heard = 0
         while flags[0] & fresh and heard < QUEUE_MOST:
             heard += 1
             flags[0] = flags[0] & ~fresh
             drive.receive(tick, NO_WAIT)
-        skipped = max(heard - 1, 0) if k else 0
+        now_ns = self._clock.now_ns()
+        skipped = self._missed(heard, now_ns) if k else 0
         if heard:
             flags[0] = flags[0] | fresh
         if skipped:
             k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
             self._outcome.skipped += skipped
-        now_ns = self._clock.now_ns()
         expected_ns = self._arrived_ns + (1 + skipped) * plan.period_ns if k else now_ns
         self._stamp(k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
-        self._arrived_ns = now_ns
+        self._arrived_ns = now_ns if heard else expected_ns
         return k, deadline_ns
+
+    def _missed(self, heard: int, now_ns: int) -> int:
+        """Periods that had no tick: those queued; where frames are missing, those that the clock counts."""
+        period_ns = self._plan.period_ns
+        queued = max(heard - 1, 0)
+        if heard and not self._cells.rx_flags[0] & COUNTER_JUMP:
+            return queued
+        late_ns = now_ns - self._arrived_ns - period_ns
+        return max(queued, (late_ns + (period_ns // 2 if heard else 0)) // period_ns)
 
     def _stamp(self, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         t = self._cells

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import pytest
@@ -214,6 +215,49 @@ def test_of_queued_feedback_the_newest_counts_and_the_others_are_skipped() -> No
     assert seen[:5] == [(0, 1, 1), (1, 1, 1), (5, 4, 1), (6, 1, 0), (7, 1, 1)]
     assert outcome.skipped == 3
     assert int(memory.ticks[2]["t_ns"][0]) == 5 * MS
+
+
+class LossyDrive(ScriptedDrive):
+    """Feedback by the drive's clock, of which some is lost; the fake clock passes while the loop waits."""
+
+    def __init__(self, clock: FakeClock, lost: set[int], stalls: dict[int, int]) -> None:
+        super().__init__()
+        self._clock, self._lost, self._stalls = clock, lost, stalls
+        self._next, self._jump = 0, 0
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        while self._next in self._lost:
+            self._next, self._jump = self._next + 1, int(RxFlag.COUNTER_JUMP)
+        comes_ns, now_ns = self._next * MS, self._clock.now_ns()
+        if comes_ns > max(deadline_ns, now_ns):
+            self._clock.advance(max(deadline_ns - now_ns, 0))
+            return
+        self._clock.advance(max(comes_ns - now_ns, 0))
+        tick["rx_flags"] |= int(RxFlag.FRESH) | self._jump
+        tick["w"], self._jump, self._next = self._next, 0, self._next + 1
+
+    def send(self, tick: Any) -> None:
+        self._clock.advance(self._stalls.pop(int(tick["k"]), 0) * MS)
+
+
+@pytest.mark.parametrize(
+    ("lost", "stalls"),
+    [({3}, {}), ({3, 4, 5, 6, 9}, {}), ({20, 21}, {5: 4}), ({7, 8, 10}, {5: 9}), (set(range(6, 30)), {5: 9})],
+)
+def test_with_cyclic_feedback_k_follows_the_time_when_frames_are_lost(
+    lost: set[int], stalls: dict[int, int]
+) -> None:
+    """The tick's index stays that of the drive's period whatever was lost; each period counts once."""
+    clock = FakeClock()
+    loop, memory, _ = make(LossyDrive(clock, lost, stalls), clock, ticks=40, pacing="feedback")  # type: ignore[arg-type]
+    outcome = loop.run()
+    fresh = [t[0] for t in memory.ticks if t["rx_flags"][0] & RxFlag.FRESH]
+    assert [int(t["k"]) for t in fresh] == [int(t["w"]) for t in fresh]
+    assert int(fresh[-1]["k"]) == 40
+    pairs = itertools.pairwise([(int(t["k"][0]), int(t["gap"][0])) for t in memory.ticks])
+    assert all(k - before == gap for (before, _), (k, gap) in pairs)
+    assert outcome.skipped == sum(int(t["skipped"][0]) for t in memory.ticks)
+    assert outcome.ticks + outcome.skipped == 41
 
 
 def test_stop_asked_twice_is_a_quick_stop() -> None:
