@@ -139,7 +139,7 @@ def _make_initramfs(tree: Path, release: str, target: Path) -> None:
 
 def _job(script: str) -> str:
     """The script that the machine runs: interfaces up, own caches on its tmpfs, then the caller's script."""
-    cache = os.environ.get("NUMBA_CACHE_DIR") or str(ROOT / ".cache" / "numba")
+    cache = kernel_cache()
     python = Path(sys.executable).parent
     return f"""\
 export PATH={shlex.quote(str(python))}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
@@ -159,14 +159,28 @@ cd {shlex.quote(str(ROOT))}
 """
 
 
+def kernel_cache() -> str:
+    """Where compiled kernels are kept for the machine."""
+    return os.environ.get("NUMBA_CACHE_DIR") or str(ROOT / ".cache" / "numba")
+
+
 def warm_kernels() -> None:
     """Compile on the host what the machine will run: compiling there takes minutes."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": kernel_cache()}
     with tempfile.TemporaryDirectory() as folder:
         short = ("--set", "loop.duration_s=0.2", "--set", f'log.folder="{folder}"')
         demo = ("hil.cli", "demo", str(ROOT / "configs" / "demo.toml"), "--lockstep", "--json", *short)
         for module in (demo, ("tests.vm.guest.process",)):
             command = [sys.executable, "-m", *module]
-            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+            done = subprocess.run(
+                command,
+                cwd=ROOT,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=600,
+                check=False,
+            )
             if done.returncode != 0:
                 raise MachineError(f"{module[0]} does not run on the host: {done.stderr.strip()}")
 
