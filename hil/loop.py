@@ -143,6 +143,8 @@ class Loop:
         else:
             self._exchange(tick, deadline_ns)
         t.received_ns[0] = min(now() - deadline_ns, MAX_NS)
+        if self._plan.pacing == "timer":
+            self._note_age(deadline_ns)
         self._prepare(self._ticks)
         self._step(self._ticks)
         t.computed_ns[0] = min(now() - deadline_ns, MAX_NS)
@@ -186,6 +188,13 @@ class Loop:
         self._stamp(k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
         self._arrived_ns = now_ns if heard else expected_ns
         return k, deadline_ns
+
+    def _note_age(self, deadline_ns: int) -> None:
+        """Paced by the timer: the newest feedback may be of an earlier tick, and ``received_ns`` says so."""
+        t = self._cells
+        if t.rx_flags[0] & int(RxFlag.FRESH):
+            self._arrived_ns = deadline_ns + t.received_ns[0]
+        t.received_ns[0] = max(self._arrived_ns - deadline_ns, -MAX_NS)
 
     def _missed(self, heard: int, now_ns: int) -> int:
         """Periods that had no tick: those queued; where frames are missing, those that the clock counts."""

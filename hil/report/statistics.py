@@ -64,6 +64,8 @@ class Phases:
     def feed(self, ticks: TickArray) -> None:
         """Take ticks; the record's cost stands in the tick after."""
         at = {n: ticks[n] * 1e-3 for n in ("lateness_ns", "received_ns", "computed_ns", "sent_ns")}
+        old = at["received_ns"] < at["lateness_ns"]  # paced by the timer: feedback of an earlier tick
+        at["received_ns"][old] = at["lateness_ns"][old]
         self.parts["woken late"].feed(at["lateness_ns"])
         self.parts["feedback"].feed(at["received_ns"] - at["lateness_ns"])
         self.parts["control"].feed(at["computed_ns"] - at["received_ns"])

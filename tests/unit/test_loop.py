@@ -186,6 +186,21 @@ def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:
     assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"]
 
 
+class SilentAtTimes(ScriptedDrive):
+    """Feedback in some ticks only."""
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        if int(tick["k"]) in (0, 1, 5):
+            super().receive(tick, deadline_ns)
+
+
+def test_timer_pacing_logs_the_age_of_the_feedback() -> None:
+    loop, memory, _ = make(SilentAtTimes(), FakeClock([300_000] * 20), ticks=6, pacing="timer")
+    loop.run()
+    ages = [int(t["received_ns"][0]) for t in memory.ticks]
+    assert ages == [300_000, 300_000, 300_000 - MS, 300_000 - 2 * MS, 300_000 - 3 * MS, 300_000, 300_000 - MS]
+
+
 class CyclicDrive(ScriptedDrive):
     """Of feedback that comes by the drive's clock: how many lie in the queue at each wait."""
 
