@@ -118,6 +118,25 @@ def test_another_makers_drive_by_configuration_alone(socketcan: Path) -> None:
     assert len(own) > 1500 and np.abs(own["w"] - own["w_ref"])[-200:].max() < 5.0
 
 
+def test_another_makers_drive_has_the_last_word(socketcan: Path) -> None:
+    """No guardian and no echo: the controller stands still, the drive's watchdog takes the voltage away."""
+    run = seen(socketcan, "other_drive_watchdog")
+    assert run.result["returncode"] == 1
+    assert run.result["run"]["ended"] in ("drive_fault", "loop_overrun")
+    modes = [data[9] for can_id, data in run.frames if can_id == 0x18FF1000]
+    assert modes[-1] == 9 and 1 in modes, "the inverter says that it has faulted"
+    stopped = run.log.ticks[run.log.ticks["reason"] != 0]
+    assert len(stopped) and not stopped["u_q"].any() and not stopped["u_d"].any()
+
+
+def test_another_makers_drive_that_is_late_is_ridden_through(socketcan: Path) -> None:
+    run = seen(socketcan, "other_drive_is_late")
+    assert run.result["returncode"] == 0 and run.result["run"]["ended"] == "stop_requested"
+    ticks = run.log.ticks
+    assert (ticks["rx_flags"] & int(RxFlag.FRESH) == 0).sum() >= 5, "nothing was late"
+    assert replay_log(run.log).verdict == "same"
+
+
 def test_the_drive_is_driven_by_hand(socketcan: Path) -> None:
     """cansend alone enables it and turns it; then its own watchdog takes the voltage away."""
     frames = frames_of(socketcan / "by_hand" / "candump.log")

@@ -64,9 +64,9 @@ class Scenario:
         words = ("run", self.config, *self._bus(self.controller), "--json", *arm, *folder)
         self.run = Forked.hil(self.folder / "run.json", *words)
 
-    def running(self) -> None:
+    def running(self, command: str = " 201#") -> None:
         """Wait until commands are on the bus and the drive has been in operation for a while."""
-        while self.dump.read_text().count(" 201#") <= 300 and self.run.poll() is None:
+        while self.dump.read_text().count(command) <= 300 and self.run.poll() is None:
             time.sleep(0.01)
 
     def __exit__(self, *_: object) -> None:
@@ -238,6 +238,27 @@ def vcan_other_drive() -> None:
         s.start()
 
 
+def other_drive_watchdog() -> None:
+    """Its own watchdog ends what nothing else does: the controller stands still, no guardian."""
+    alone = ("guardian.enabled=false",)
+    with Scenario("other_drive_watchdog", config="configs/inverter.toml", seconds=30.0, settings=alone) as s:
+        s.start()
+        s.running(" 18FF1100#")
+        s.run.send_signal(signal.SIGSTOP)
+        time.sleep(0.15)
+        s.run.send_signal(signal.SIGCONT)
+
+
+def other_drive_is_late() -> None:
+    """Its feedback stays away for 15 ms and then comes in a heap."""
+    with Scenario("other_drive_is_late", config="configs/inverter.toml", seconds=2.0) as s:
+        s.start()
+        s.running(" 18FF1100#")
+        s.emulator.send_signal(signal.SIGSTOP)
+        time.sleep(0.015)
+        s.emulator.send_signal(signal.SIGCONT)
+
+
 def controller_is_killed() -> None:
     """With the drive's watchdog off: what stops it is the guardian."""
     with Scenario("controller_is_killed", seconds=30.0, plant=("firmware.watchdog_ms=0.0",)) as s:
@@ -279,6 +300,8 @@ def main() -> int:
         kvaser_pair,
         vcan_fd,
         vcan_other_drive,
+        other_drive_watchdog,
+        other_drive_is_late,
         by_hand,
         controller_is_killed,
         interface_goes_down_and_up,
