@@ -39,7 +39,6 @@ def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
     from hil.app import check_arming, is_emulated_bus, load_setup, run
     from hil.arming import confirm, requesting
-    from hil.view import run_table, show
 
     setup = load_setup(args.config, overrides(args))
     check_arming(setup, args.arm)
@@ -50,6 +49,8 @@ def cmd_run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result.as_dict())
     else:
+        from hil.view import run_table, show  # not before: what it imports would keep the drive waiting
+
         show(run_table(result))
     return 0 if result.ok else EXIT_FAILED
 
