@@ -6,6 +6,7 @@ deadlines. A late tick is never caught up by a burst: whole periods are skipped 
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -20,6 +21,8 @@ MAX_NS = 2**31 - 1
 NO_WAIT = 1
 """A deadline that has long passed: one feedback if it is there already."""
 COUNTER_JUMP = int(RxFlag.COUNTER_JUMP)
+FULL = (errno.ENOBUFS, errno.EAGAIN)
+"""A bus that takes nothing more for now; what the loop sends next is still worth trying."""
 QUEUE_MOST = 4096
 """Queued feedback that one tick takes; a flood can't hold it longer."""
 ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
@@ -230,8 +233,9 @@ class Loop:
         if plan.pacing == "sync":
             try:
                 drive.sync(tick)
-            except OSError:
-                self._cells.rx_flags[0] |= int(RxFlag.BUS_DOWN)
+            except OSError as error:
+                kind = RxFlag.SEND_FAILED if error.errno in FULL else RxFlag.BUS_DOWN
+                self._cells.rx_flags[0] |= int(kind)
                 return
             drive.receive(tick, self._clock.receive_deadline(deadline_ns, plan.timeout_ns))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 from typing import Any
 
@@ -148,6 +149,22 @@ def test_a_sync_that_fails_is_a_bus_that_is_down() -> None:
     loop.run()
     assert memory.ticks[1]["rx_flags"][0] & RxFlag.BUS_DOWN
     assert drive.calls[-1] == "stop"
+
+
+class Full(OSError):
+    """What the kernel says when the transmit queue is full."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(errno.ENOBUFS, text)
+
+
+def test_a_sync_that_meets_a_full_queue_is_a_failed_send() -> None:
+    drive = ScriptedDrive({"sync": 2}, Full)
+    loop, memory, _ = make(drive, FakeClock(), ticks=4)
+    loop.run()
+    flags = memory.ticks[1]["rx_flags"][0]
+    assert flags & RxFlag.SEND_FAILED and not flags & RxFlag.BUS_DOWN
+    assert ("bus", 1, "SEND_FAILED") in memory.said
 
 
 def test_a_command_that_fails_is_logged() -> None:
