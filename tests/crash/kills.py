@@ -39,9 +39,9 @@ from hil.simulate import simulate_ticks
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.toml"
 VICTIMS = ("controller", "writer", "emulator", "guardian")
 AT_REST = ("SWITCH_ON_DISABLED", "FAULT")
-PATIENCE_S = 30.0
+PATIENCE_S = 90.0
 SECOND_NS = 1_000_000_000
-ATTEMPTS = 4
+ATTEMPTS = 10
 
 
 @dataclass
@@ -159,7 +159,7 @@ def attempt(trial: Trial, folder: Path) -> Trial:
     pids = {"controller": controller, "emulator": drive}
     log = folder / "run.mcap"
     try:
-        begun = until(lambda: log.is_file() and log.stat().st_size > 30_000)
+        begun = until(lambda: log.is_file() and log.stat().st_size > 60_000)
         pids |= relatives(controller)
         if not begun or len(pids) < 4:
             said = " ".join((folder / "run.txt").read_text().split())
