@@ -61,6 +61,17 @@ def shot(page: Page, report: Path, picture: str, selector: str, script: str = "t
     page.picture(OUT / picture)
 
 
+def matrix(page: Page, folder: Path) -> None:
+    """The fault matrix's page: rows in lockstep, the same on every machine."""
+    names = ("bus-off", "encoder slip", "phase loss", "load step", "brown-out", "DC-link")
+    only = [word for name in names for word in ("--only", name)]
+    hil("faults", *only, "--html", str(folder / "faults.html"), "--folder", str(folder / "faults"))
+    page.open(folder / "faults.html")
+    page.picture(OUT / "faults.png")
+    page.evaluate("document.querySelector('h2').scrollIntoView()")
+    page.picture(OUT / "faults-runs.png")
+
+
 def main() -> None:
     """Make all pictures."""
     with tempfile.TemporaryDirectory() as name, chromium() as browser:
@@ -78,6 +89,7 @@ def main() -> None:
         shot(page, one, "report-dark.png", "h1")
         page.dark(False)
         table(page, folder, "demo")
+        matrix(page, folder)
 
 
 if __name__ == "__main__":
