@@ -36,7 +36,7 @@ const {FoxgloveClient} = require("@foxglove/ws-protocol"), WebSocket = require("
 const socket = new WebSocket(process.argv[1], ["foxglove.sdk.v1"]);
 const client = new FoxgloveClient({ws: socket}), channels = {}, ticks = [];
 let subscription;
-const out = found => { console.log(JSON.stringify(found)); process.exit(); };
+const out = found => process.stdout.write(JSON.stringify(found), () => process.exit());
 client.on("error", error => out({error: String(error)}));
 client.on("serverInfo", info => { channels.info = info.name; });
 client.on("advertise", all => all.forEach(one => {
@@ -44,7 +44,7 @@ client.on("advertise", all => all.forEach(one => {
   if (one.topic === "/tick") subscription = client.subscribe(one.id);
 }));
 client.on("message", ({subscriptionId, timestamp, data}) => {
-  if (subscriptionId !== subscription) return;
+  if (subscriptionId !== subscription || ticks.length === 500) return;
   const bytes = Buffer.from(data.buffer, data.byteOffset, data.byteLength);
   ticks.push([String(timestamp), bytes.toString("base64")]);
   if (ticks.length === 500) out({channels, ticks});
