@@ -70,11 +70,11 @@ def curves(ticks: TickArray, width: int) -> Table:
 def _state(look: Look, ticks: TickArray) -> Text:
     now = figures(look, ticks)
     state, reason = now["state"], now["reason"]
-    text = Text(state.replace("_", " "), style=STATE_STYLES.get(state, "bold"))
+    text = Text().append(state.replace("_", " "), style=STATE_STYLES.get(state, "bold"))
     if reason:
         text.append(f"  ({reason.replace('_', ' ')})", style="bold yellow")
     total = f" of {look.entry.ticks}" if look.entry.ticks else ""
-    text.append(f"   tick {now['k']}{total}", style="default")
+    text.append(f"   tick {now['k']}{total}")
     if now.get("rate_hz"):
         late = now["lateness_us"]
         text.append(f"   {now['rate_hz']:.0f} Hz of {look.entry.rate_hz}")
