@@ -23,6 +23,8 @@ _FLAGS = EFF_FLAG | RTR_FLAG | ERR_FLAG
 DISCARD_MOST = 100_000
 PLAIN = ("socketcan", "hil-local", "virtual")
 """Interfaces that are all there is to be said of them."""
+RECEIVE_BYTES = 128
+"""More than a frame: a datagram that is none is seen to be longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +85,8 @@ class SocketLink:
         poll = select.poll()
         poll.register(receiving, select.POLLIN)
         self._poll = poll.poll
-        self._recv, self._write = receiving.recv, sending.send
+        self._recv_into, self._write = receiving.recv_into, sending.send
+        self._own = memoryview(bytearray(RECEIVE_BYTES))
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
@@ -107,7 +110,7 @@ class SocketLink:
         except ValueError:  # closed
             return True
 
-    def send_raw(self, raw: bytes) -> None:
+    def send_raw(self, raw: memoryview) -> None:
         """Send a frame that is laid out already; the caller answers for it."""
         try:
             self._write(raw)
@@ -116,20 +119,23 @@ class SocketLink:
 
     def receive(self, timeout_ns: int) -> Frame | None:
         """Return the next frame, or None."""
-        raw = self.receive_raw(timeout_ns)
-        return None if raw is None else unpack_frame(raw)
+        size = self.receive_into(self._own, timeout_ns)
+        return unpack_frame(bytes(self._own[:size])) if size else None
 
-    def receive_raw(self, timeout_ns: int) -> bytes | None:
-        """Return what the socket has next, or None. With no time to wait, poll tells without an exception."""
+    def receive_into(self, buffer: memoryview, timeout_ns: int) -> int:
+        """Read what the socket has next; return its size, 0 for nothing.
+
+        With no time to wait, poll tells without an exception.
+        """
         try:
             if timeout_ns > 0:
                 if not select.select(self._fds, [], [], timeout_ns * 1e-9)[0]:
-                    return None
+                    return 0
             elif not self._poll(0):
-                return None
-            return self._recv(128)
+                return 0
+            return self._recv_into(buffer)
         except BlockingIOError:
-            return None
+            return 0
         except ValueError:  # the descriptor of a closed link
             raise_link_error(OSError(errno.EBADF, "closed"), "receive")
         except OSError as error:

@@ -1,7 +1,7 @@
 """The drive client: one drive on a link, seen as a port of the control loop.
 
-Fills a tick record in place by field name, so it needs no knowledge of who owns the record. What arrives
-damaged, repeated or of the wrong length is flagged and not applied; a bus that is down is flagged and
+Fills a tick record in place, its fields found by name, so it needs no knowledge of who owns the record. What
+arrives damaged, repeated or of the wrong length is flagged and not applied; a bus that is down is flagged and
 nothing is sent until the client is closed.
 """
 
@@ -10,13 +10,15 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NoReturn
+
+import numpy as np
 
 from drivers.binding import Binding, bind
-from drivers.bus import Frame, Link, SocketLink, unpack_frame
+from drivers.bus import RECEIVE_BYTES, Frame, Link, unpack_frame
 from drivers.codec import Database, Message
-from drivers.errors import LinkDown, LinkError, QueueFull
-from drivers.fast import DATA_AT, Maker, RawFrame, RawOut, Take, key_of, size_of, taker
+from drivers.errors import EncodeError, LinkDown, LinkError, QueueFull
 from drivers.frames import (
     BUS_DOWN,
     EMERGENCY,
@@ -25,14 +27,16 @@ from drivers.frames import (
     FRESH,
     LENGTH_ERROR,
     SEND_FAILED,
-    STATUS,
-    Incoming,
-    Outgoing,
+    SOURCES,
 )
-from drivers.local import ERR_FLAG, pack_frame
-from drivers.mapping import MEASURED, DriveMap, house_map
-from drivers.record import Cell, TranslatedCell, cell_of
+from drivers.jit import entry
+from drivers.local import CLASSIC, ERR_FLAG, FD
+from drivers.mapping import DriveMap, house_map
+from drivers.rawlink import raw_link
+from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
+from drivers.tables import incoming_tables, laid_out, outgoing_tables
+from drivers.wire import FRAME, ROOM, STATE, STATE_RAW, encode, note_sent, take
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
@@ -40,17 +44,24 @@ STOP_REPEATS: Final = 5
 STOP_PAUSE_S: Final = 0.002
 DRAIN_MOST: Final = 256
 DOWN: Final = "the bus was down; nothing more is sent"
-OnFrame = Callable[[bool, int, int, bytes], None]
-Handler = Callable[[bytes], int]
-_SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
+OnFrames = Callable[[memoryview], None]
+"""Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
+Send = Callable[[int], int]
+_GOT, _NEEDED, _ECHO_AT, _LAST_SENT, _LOGGED = range(5)
 
 
-def ignore_frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-    """Take no note of a frame."""
+class Outgoing:
+    """One message to send: its frame in a buffer, and what lays a command out there."""
+
+    def __init__(self, message: Message, index: int) -> None:
+        self.message, self.index = message, index
+        self.raw = laid_out(message.send_id, message.length, message.fd)
+        self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
+        self.encode: Send = lambda t_ns: -1
 
 
 class DriveClient:
-    """A drive on a link. ``now`` stamps frames; ``on_frame`` sees each frame sent or received.
+    """A drive on a link. ``now`` stamps frames; ``on_frames`` sees each frame sent or received.
 
     ``drive_map`` says which frame plays which part; without one the DBC is of the house protocol.
     """
@@ -61,125 +72,66 @@ class DriveClient:
         database: Database,
         *,
         load: bool = False,
-        on_frame: OnFrame = ignore_frame,
+        on_frames: OnFrames | None = None,
         now: Callable[[], int] = time.monotonic_ns,
         drive_map: DriveMap | None = None,
     ) -> None:
-        self._link, self._on_frame, self._now = link, on_frame, now
-        self._quiet = on_frame is ignore_frame
+        self._link, self._on_frames, self._now = link, on_frames, now
         self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
+        self._raw_link = raw_link(link, any(bound.message.fd for bound in self.binding.outgoing))
         self.seen: Counter[int] = Counter()
-        self._sync_counter = self._last_sent = self._last_controlword = 0
+        self._sync_counter = self._last_controlword = 0
         self._pending_flags = 0
         self._down = self._late = False
         self._tick: Any = None
-        self._sent_cells: list[Cell] = []
-        self._incoming = [Incoming(bound) for bound in self.binding.incoming]
-        self._outgoing = [Outgoing(bound) for bound in self.binding.outgoing]
-        self._needed = self._got = 0
-        self._handlers: dict[int, Handler] = {}
-        self._makers: list[Maker] = []
-        self._raw: dict[bytes, RawFrame] = {}
-        self._raw_out: list[RawOut] = []
-        self._raw_syncs: list[tuple[int, bytes, bytes]] = []
-        self._register()
-        self._prepare_raw(link)
+        foreign = [bound.message for bound in self.binding.outgoing]
+        self._foreign = {m.send_id for m in [*foreign, self.binding.sync] if m is not None}
+        alive = [bound.message for bound in self.binding.incoming]
+        self._alive = {m.send_id for m in [*alive, self.binding.heartbeat] if m is not None}
+        self._make_buffers()
+        self._make_senders()
 
-    def _register(self) -> None:
-        """Fill the table of who handles which identifier."""
-        binding = self.binding
-        alive = [bound.message for bound in binding.incoming]
-        for bound, incoming in zip(binding.incoming, self._incoming, strict=True):
-            bit = self._bit(incoming)
-            self._needed |= bit
-            self._handlers[bound.message.send_id] = self._handler(incoming, bit)
-        foreign = [bound.message for bound in binding.outgoing] + [binding.sync] * (binding.sync is not None)
-        self._handlers |= {message.send_id: self._on_foreign for message in foreign if message}
-        if binding.emergency:
-            self._handlers[binding.emergency.send_id] = self._on_emergency
-        if binding.heartbeat:
-            alive.append(binding.heartbeat)
-        self._alive = {message.send_id for message in alive}
-        self._has_echo = bool(binding.map.echo)
+    def _make_buffers(self) -> None:
+        """The frame that came, the log of frames, and the state that the kernels share."""
+        self._buffer = np.zeros(RECEIVE_BYTES, np.uint8)
+        self._buffer_view = self._buffer.data
+        self._words = np.zeros(2, np.uint32)
+        self._log = np.zeros(ROOM if self._on_frames else 0, FRAME)
+        self._log_bytes = self._log.view("u1").data if self._on_frames else memoryview(b"")
+        self._state = np.zeros(1, STATE)
+        self._cells: Any = self._state.view("i8").data
+        self._last = np.full(max(len(self.binding.incoming), 1), -1, np.int64)
 
-    def _prepare_raw(self, link: Link) -> None:
-        """Where the link has a socket, frames go past the plain way; :meth:`_bind` fills in the cells."""
-        self._raw_link = link if isinstance(link, SocketLink) else None
-        if self._raw_link is None:
-            return
-        pairs = zip(self.binding.incoming, self._incoming, strict=True)
-        self._makers = [taker(bound, FRESH if self._bit(i) else self._mark(i)) for bound, i in pairs]
+    def _make_senders(self) -> None:
+        """What lays out and sends each command and SYNC."""
+        messages, signals, constants = outgoing_tables(self.binding)
+        values = np.array([*[0.0] * len(SOURCES), *constants])
+        values[SOURCES.index("load_enable")] = 1.0
+        self._values: Any = values.data
+        self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
+        for out in self._outgoing:
+            args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
+            out.encode = partial(entry(encode, *args, 0), *args)
         sync = self.binding.sync
-        if sync is not None and sync.length == 1 and not sync.fd:
-            every = [bytes((count,)) for count in range(1, 241)]
-            self._raw_syncs = [(sync.send_id, data, pack_frame(sync.send_id, data)) for data in every]
-        if all(self._raw_link.carries(out.fd) for out in self._outgoing):
-            both = zip(self.binding.outgoing, self._outgoing, strict=True)
-            self._raw_out = [RawOut(bound, out) for bound, out in both]
-
-    def _bit(self, incoming: Incoming) -> int:
-        """The bit of a message that measures, 0 for others."""
-        return 1 << self._incoming.index(incoming) if set(incoming.parts) & set(MEASURED) else 0
-
-    def _mark(self, incoming: Incoming) -> int:
-        """The flag that a message of slow values raises."""
-        return STATUS if "v_dc" in incoming.parts else 0
-
-    def _bind_raw(self) -> None:
-        """Takers over the cells of the bound tick."""
-        for bound, incoming, maker in zip(self.binding.incoming, self._incoming, self._makers, strict=False):
-            take = self._raw_taker(incoming, maker(incoming, incoming.cells))
-            message = bound.message
-            known = RawFrame(take, size_of(bound), message.send_id, DATA_AT + message.length)
-            self._raw[key_of(bound)] = known
-
-    def _raw_taker(self, incoming: Incoming, take: Take) -> Take:
-        """What takes a raw frame of one message, as :meth:`_handler` takes its data."""
-        bit = self._bit(incoming)
-        if not bit:
-            return lambda raw, late: take(raw, False)
-        if bit == self._needed and self._has_echo:
-            return take
-        return lambda raw, late: self._complete(take(raw, late), bit)
-
-    def _complete(self, flags: int, bit: int) -> int:
-        """Flags of a measuring message: fresh once all of this tick's have come."""
-        if not flags & FRESH:
-            return flags
-        self._got |= bit
-        if self._got != self._needed:
-            return flags & ~FRESH
-        self._got = 0
-        if not self._has_echo:
-            self._echo_cell[0] = self._last_sent
-        return flags
-
-    def _handler(self, incoming: Incoming, bit: int) -> Handler:
-        """What takes one message: a measurement (``bit``), or slow values that are applied when they come."""
-        mark = self._mark(incoming)
-
-        def measure(data: bytes) -> int:
-            return self._complete(incoming.take(data, self._late), bit)
-
-        def status(data: bytes) -> int:
-            flags = incoming.take(data)
-            return flags ^ FRESH | mark if flags & FRESH else flags
-
-        return measure if bit else status
+        self._sync = None if sync is None else Outgoing(sync, 0)
+        if self._sync is not None:
+            self._sync.raw[4] = min(self._sync.message.length, 1)
+            noting = (self._log, self._state, self._sync.raw)
+            self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
 
     def _bind(self, tick: Any) -> None:
-        """Reach the fields of this tick record; the loop hands in the same one each time."""
-        translate = translator(self.binding.map.states, lambda: self._last_controlword)
-        for incoming in self._incoming:
-            incoming.cells = [cell_of(tick, name) for name in incoming.fields]
-            if translate is not None and "state" in incoming.parts:
-                place = incoming.parts.index("state")
-                incoming.cells[place] = TranslatedCell(incoming.cells[place], translate)
-        self._flags_cell, self._echo_cell = cell_of(tick, "rx_flags"), cell_of(tick, "echo")
+        """Reach this tick record; the loop hands in the same one each time. Raises TypeError for another."""
+        raw = bytes_of(tick)
+        messages, signals, needed = incoming_tables(self.binding, tick.dtype)
+        self._cells[_NEEDED] = needed
+        self._cells[_ECHO_AT] = -1 if self.binding.map.echo else tick.dtype.fields["echo"][1]
+        args = (self._buffer, messages, signals, self._last, self._state, self._words, raw, self._log)
+        self._take: Callable[[int, bool, int], int] = partial(entry(take, *args, 0, False, 0), *args)
+        self._translate = translator(self.binding.map.states, lambda: self._last_controlword)
+        self._flags_cell, self._state_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_state")
         self._error_cell = cell_of(tick, "drive_error")
-        self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
+        self._sent_cells = [cell_of(tick, name) for name in ("counter", "controlword", "u_q", "u_d", "T_L")]
         self._tick = tick
-        self._bind_raw()
 
     @property
     def command(self) -> Message:
@@ -188,16 +140,10 @@ class DriveClient:
 
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
-        self._got = 0
-        if self._has_come(tick):
+        self._cells[_GOT] = 0
+        if tick is not self._tick or self._pending_flags or self._down or self._raw_link.pending():
             self._take_late(tick)
         self._send_sync()
-
-    def _has_come(self, tick: Any) -> bool:
-        """True when there is something to take or to flag before the next SYNC."""
-        if self._raw_link is None or self._pending_flags or self._down or tick is not self._tick:
-            return True
-        return self._raw_link.pending()
 
     def _take_late(self, tick: Any) -> None:
         self._late = True
@@ -205,17 +151,16 @@ class DriveClient:
             self.receive(tick, 0)
         finally:
             self._late = False
-            self._got = 0
+            self._cells[_GOT] = 0
 
     def _send_sync(self) -> None:
-        sync = self.binding.sync
-        if sync is None:
+        if self._sync is None:
             return
-        self._sync_counter = self._sync_counter % 240 + 1
-        if self._raw_syncs:
-            self._send_raw(*self._raw_syncs[self._sync_counter - 1])
-            return
-        self._send(sync.send_id, bytes((self._sync_counter,)) if sync.length else b"", False)
+        self._sync_counter = count = self._sync_counter % 240 + 1
+        if self._sync.raw[4]:
+            self._sync.view[8] = count
+        self._sync.encode(self._now())
+        self._transmit(self._sync)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Drain the bus until feedback came or the deadline passed; 0 drains what is there (newest wins).
@@ -231,49 +176,46 @@ class DriveClient:
             self._down = True
         except LinkError:
             flags |= ERROR_FRAME
-        self._flags_cell[0] = int(self._flags_cell[0]) | flags | (BUS_DOWN if self._down else 0)
+        self._flags_cell[0] |= flags | (BUS_DOWN if self._down else 0)
 
     def _drain(self, deadline_ns: int) -> int:
-        """Flags of all that came; on a socket frames are taken whole, without being taken apart first."""
-        raw = self._raw_link
-        receive: Callable[[int], Any] = self._link.receive if raw is None else raw.receive_raw
-        take: Callable[[Any], int] = self._take if raw is None else self._take_raw
+        """Flags of all that came."""
+        receive, buffer, cells = self._raw_link.receive_into, self._buffer_view, self._cells
         flags, left, more = 0, 0, DRAIN_MOST
         while more:
             if deadline_ns and (left := deadline_ns - time.monotonic_ns()) < 0:
                 left = 0
             more -= left == 0
-            frame = receive(left)
-            if frame is None:
+            size = receive(buffer, left)
+            if not size:
                 break
-            flags |= take(frame)
-            if deadline_ns and flags & FRESH:
+            seen = self._take(size, self._late, self._now())
+            flags |= seen if 0 <= seen < STATE_RAW else self._finish(seen, size)
+            if cells[_LOGGED] >= ROOM - 1:
+                self.flush()
+            if flags & FRESH and deadline_ns:
                 break
         return flags
 
-    def _take_raw(self, raw: bytes) -> int:
-        """Handle one frame as it came from the socket; return its flags."""
-        known = self._raw.get(raw[:5])
-        if known is None or len(raw) != known.size:
-            return self._take_unknown(raw)
-        if not self._quiet:
-            self._on_frame(True, self._now(), known.send_id, raw[DATA_AT : known.end])
-        return known.take(raw, self._late)
+    def _finish(self, seen: int, size: int) -> int:
+        """Flags of a frame that the kernel leaves to be finished: one of no measurement, or a raw state."""
+        if seen < 0:
+            frame = unpack_frame(bytes(self._buffer_view[:size]))
+            return 0 if frame is None else self._other(frame)
+        assert self._translate is not None  # noqa: S101 - without a translation no state is raw
+        self._state_cell[0] = self._translate(self._state_cell[0])
+        return seen ^ STATE_RAW
 
-    def _take_unknown(self, raw: bytes) -> int:
-        """Flags of what is no frame of ours, or none at all."""
-        frame = unpack_frame(raw)
-        return 0 if frame is None else self._take(frame)
-
-    def _take(self, frame: Frame) -> int:
-        """Handle one frame; return its flags. Remote and error frames match no identifier."""
+    def _other(self, frame: Frame) -> int:
+        """Flags of a frame that measures nothing. Remote frames match no identifier."""
         can_id, data, frame_flags, _ = frame
-        if not self._quiet:
-            self._on_frame(True, self._now(), can_id | frame_flags, data)
-        handler = self._handlers.get(can_id | frame_flags)
-        if handler is not None:
-            return handler(data)
-        return self._on_error(can_id) if frame_flags & ERR_FLAG else 0
+        if frame_flags & ERR_FLAG:
+            return self._on_error(can_id)
+        whole = can_id | frame_flags
+        if whole in self._foreign:
+            return FOREIGN_COMMAND
+        emergency = self.binding.emergency
+        return self._on_emergency(data) if emergency and whole == emergency.send_id else 0
 
     def _on_error(self, error_class: int) -> int:
         """A controller that went off the bus, or came back to it, is down for good: nothing more is sent."""
@@ -289,48 +231,49 @@ class DriveClient:
         self._error_cell[0] = code
         return EMERGENCY if code else 0
 
-    def _on_foreign(self, data: bytes) -> int:
-        return FOREIGN_COMMAND
-
     def warm_up(self, tick: Any) -> None:
-        """Bind and encode once without sending, so that the first tick is like the others."""
+        """Bind, so that the first tick is like the others."""
         self._bind(tick)
-        for out in self._outgoing:
-            out.encode(0, (0, 0.0, 0.0, 0.0, False, False, 1))
 
     def send(self, tick: Any) -> None:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:
             self._bind(tick)
         counter, controlword, u_q, u_d, T_L = self._sent_cells
-        self._send_command(int(counter[0]), int(controlword[0]), float(u_q[0]), float(u_d[0]), float(T_L[0]))
+        self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
 
     def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
-        """Encode all frames before the first is sent, then send them, the one with u_q last."""
-        enable = controlword == ENABLE_OPERATION
-        reset = controlword & FAULT_RESET != 0
-        values = (controlword, u_q, u_d, T_L, enable, reset, 1)
-        if self._raw_out:
-            encoded = [(out, out.encode(counter, values)) for out in self._raw_out]
-            for out, data in encoded:
-                self._send_raw(out.send_id, data, out.head + data + out.tail)
-        else:
-            frames = [(out.send_id, out.encode(counter, values), out.fd) for out in self._outgoing]
-            for can_id, data, fd in frames:
-                self._send(can_id, data, fd)
-        self._last_sent, self._last_controlword = counter, controlword
+        """Lay out all frames before the first is sent, then send them, the one with u_q last."""
+        values = self._values
+        values[0], values[1], values[2], values[3], values[4] = counter, controlword, u_q, u_d, T_L
+        values[5], values[6] = controlword == ENABLE_OPERATION, controlword & FAULT_RESET != 0
+        now_ns = self._now()
+        for out in self._outgoing:
+            if out.encode(now_ns) < 0:
+                self._refuse(out)
+        for out in self._outgoing:
+            self._transmit(out)
+        self._cells[_LAST_SENT], self._last_controlword = counter, controlword
+        self.flush()
 
-    def _send_raw(self, can_id: int, data: bytes, raw: bytes) -> None:
-        assert self._raw_link is not None  # noqa: S101 - there is no raw frame without it
+    def _refuse(self, out: Outgoing) -> NoReturn:
+        """Raise with the codec's words what of a command can't be sent."""
+        bound = self.binding.outgoing[out.index]
+        names = dict(bound.parts)
+        out.message.encode({names[part]: self._values[i] for i, part in enumerate(SOURCES) if part in names})
+        raise EncodeError(f"{out.message.name}: can't be sent")
+
+    def _transmit(self, out: Outgoing) -> None:
+        """Hand a frame that is laid out to the bus."""
         if self._down:
             raise LinkDown(100, DOWN)
         try:
-            self._raw_link.send_raw(raw)
+            self._raw_link.send_raw(out.view)
         except LinkError as error:
             self._note_failure(error)
             raise
-        if not self._quiet:
-            self._on_frame(False, self._now(), can_id, data)
+        if self._on_frames is not None:
+            self._cells[_LOGGED] += 1
 
     def _note_failure(self, error: LinkError) -> None:
         """A bus that is down stays down; anything else is flagged in the next tick."""
@@ -339,25 +282,21 @@ class DriveClient:
         else:
             self._pending_flags |= SEND_FAILED
 
-    def _send(self, can_id: int, data: bytes, fd: bool) -> None:
-        if self._down:
-            raise LinkDown(100, DOWN)
-        try:
-            self._link.send(can_id, data, fd)
-        except LinkError as error:
-            self._note_failure(error)
-            raise
-        if not self._quiet:
-            self._on_frame(False, self._now(), can_id, data)
+    def flush(self) -> None:
+        """Hand the frames of this tick on."""
+        count = self._cells[_LOGGED]
+        if count and self._on_frames is not None:
+            self._cells[_LOGGED] = 0
+            self._on_frames(self._log_bytes[: count * FRAME.itemsize])
 
     def stop_from(self, counter: int) -> None:
         """:meth:`stop` with counters after ``counter``: for another process than the one that sent."""
-        self._last_sent = counter
+        self._cells[_LAST_SENT] = counter
         self.stop()
 
     def stop(self) -> None:
         """Zero voltage and disable, a few times with advancing counters and SYNC; never raises."""
-        counter = self._last_sent
+        counter = self._cells[_LAST_SENT]
         for _ in range(STOP_REPEATS):
             counter = (counter + 1) % self.binding.counter_modulus
             try:
@@ -366,7 +305,8 @@ class DriveClient:
             except QueueFull:
                 time.sleep(STOP_PAUSE_S)
             except LinkError:
-                return
+                break
+        self.flush()
 
     def listen(self, seconds: float) -> Counter[int]:
         """Only listen; return how often each identifier was seen. Sends nothing."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.binding import Binding
-from drivers.errors import DatabaseError
+import numpy as np
 
-OnFrame = Callable[[bool, int, int, bytes], None]
+from drivers.binding import Binding
+from drivers.client import OnFrames
+from drivers.errors import DatabaseError
+from drivers.wire import FRAME
 
 
 class CommandWatch:
@@ -27,15 +29,17 @@ class CommandWatch:
         self._by_counter = [(0.0, 0.0)] * bound.counter_modulus
         self._newest = (0.0, 0.0)
 
-    def chained(self, after: OnFrame) -> OnFrame:
-        """Return what takes note of a frame and hands it on to ``after``."""
+    def chained(self, after: OnFrames | None) -> OnFrames:
+        """Return what takes note of frames and hands them on to ``after``."""
 
-        def on_frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-            if can_id == self._message.send_id:
-                self.take(data)
-            after(received, t_ns, can_id, data)
+        def on_frames(records: memoryview) -> None:
+            for frame in np.frombuffer(records, FRAME):
+                if frame["can_id"] == self._message.send_id:
+                    self.take(frame["data"][: frame["size"]].tobytes())
+            if after is not None:
+                after(records)
 
-        return on_frame
+        return on_frames
 
     def take(self, data: bytes) -> None:
         """Take note of a command, whole and valid or not at all."""
@@ -43,6 +47,15 @@ class CommandWatch:
             u_q, u_d, *counter = self._read(data)
             self._newest = (u_q, u_d)
             self._by_counter[int(counter[0]) if counter else 0] = self._newest
+
+    def after(self, flush: Callable[[], None]) -> Callable[[int], tuple[float, float]]:
+        """:meth:`applied`, once the frames that came are handed on."""
+
+        def applied(echo: int) -> tuple[float, float]:
+            flush()
+            return self.applied(echo)
+
+        return applied
 
     def applied(self, echo: int) -> tuple[float, float]:
         """Voltages of the newest command with that counter; zeros when none was seen."""

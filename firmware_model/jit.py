@@ -1,40 +1,7 @@
-"""How the emulator's kernels are compiled; the emulator shares no code with the controller."""
+"""How the emulator's kernels are compiled: as the wire's. The emulator shares no control code."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeVar, cast
+from drivers.jit import cache_folder, jit
 
-import numba
-from numba.core import config as numba_config
-
-config: Any = numba_config  # its attributes are made at run time
-config.CPU_NAME = "generic"
-config.CPU_FEATURES = ""
-
-
-def cache_folder(root: Path) -> Path:
-    """Folder of compiled kernels for exactly this source.
-
-    numba looks at the file of a function, not at those of the functions that it calls; a digest of all
-    sources keeps it from running an old callee inside a new caller.
-    """
-    digest = hashlib.sha256()
-    for package in ("hil", "drivers", "firmware_model"):
-        for path in sorted((root / package).rglob("*.py")):
-            digest.update(path.read_bytes())
-    base = Path(os.environ.get("NUMBA_CACHE_DIR") or root / ".cache" / "numba")
-    return base / digest.hexdigest()[:16]
-
-
-config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[1]))
-
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def jit(function: Function) -> Function:
-    """Compile with numba: exact IEEE arithmetic, generic processor, cached on disk."""
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+__all__ = ["cache_folder", "jit"]

@@ -20,7 +20,7 @@ from typing import Any
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, Link, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
-from drivers.client import DriveClient, OnFrame, ignore_frame
+from drivers.client import DriveClient, OnFrames
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
@@ -301,8 +301,8 @@ def opened_client(
     watch: CommandWatch | None = None,
 ) -> Iterator[DriveClient]:
     """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
-    on_frame = recorder.frame if recorder and setup.config.log.frames else ignore_frame
-    client = _client(setup, watch.chained(on_frame) if watch else on_frame, clock.now_ns)
+    on_frames = recorder.frames if recorder and setup.config.log.frames else None
+    client = _client(setup, watch.chained(on_frames) if watch else on_frames, clock.now_ns)
     try:
         yield client
     finally:
@@ -310,7 +310,7 @@ def opened_client(
 
 
 def _client(
-    setup: Setup, on_frame: OnFrame = ignore_frame, now: Callable[[], int] = time.monotonic_ns
+    setup: Setup, on_frames: OnFrames | None = None, now: Callable[[], int] = time.monotonic_ns
 ) -> DriveClient:
     """A drive client on a link of its own, warmed up."""
     load = setup.config.controller.kind == "fac"
@@ -319,7 +319,7 @@ def _client(
         sync = setup.database.optional("SYNC")
         link = LockstepLink(link, sync.send_id if sync else None)
     client = DriveClient(
-        link, setup.database, load=load, drive_map=setup.binding.map, on_frame=on_frame, now=now
+        link, setup.database, load=load, drive_map=setup.binding.map, on_frames=on_frames, now=now
     )
     client.warm_up(new_ticks()[0])
     return client
@@ -406,7 +406,7 @@ def _recorded(
             _await_drive(setup, client)
             say(f"{'listening only' if watch else 'arming'}; log {path}")
             client.discard()
-            drive: Drive = ShadowDrive(client, watch.applied) if watch else client
+            drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
             if words:
                 drive = GuardedDrive(client, words, clock.now_ns)
             if watch:

@@ -59,8 +59,5 @@ class Recorder(Protocol):
     def tick(self, tick: TickArray) -> None:
         """Store one tick record."""
 
-    def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-        """Store one raw CAN frame."""
-
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Store one event."""

@@ -10,19 +10,17 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, Final
 
 from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
 from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
-from hil.log.ring import BEAT_AT, DROPPED_AT, FAILED_AT, HEAD_AT, HEADER_BYTES, TAIL_AT, Ring
+from hil.log.ring import BEAT_AT, FAILED_AT, Ring
 from hil.signals import TICK, TickArray, new_ticks
 
 __all__ = ["BYTES_PER_TICK", "LogError", "Recorder", "check_folder", "open_recorder"]
 
-FramePacker = Callable[[bool, int, int, bytes], None]
 RING_SECONDS: Final = 4
 FRAMES_PER_TICK: Final = 5
 BYTES_PER_TICK: Final = TICK.itemsize + 31 + 4 * 60
@@ -69,23 +67,6 @@ def first_line(stream: IO[bytes], timeout_s: float) -> str:
     return stream.readline().decode(errors="replace").strip()
 
 
-def frame_packer(ring: Ring) -> FramePacker:
-    """A function that stores one raw CAN frame: packed in place, since a tick has four of them."""
-    header, memory, pack_into = ring.header, ring.memory, FRAME_RECORD.pack_into
-    size, capacity = ring.record_size, ring.capacity
-
-    def frame(received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-        head = header[HEAD_AT]
-        if head - header[TAIL_AT] >= capacity:
-            header[DROPPED_AT] += 1
-            return
-        at = HEADER_BYTES + head % capacity * size
-        pack_into(memory, at, t_ns, can_id, received, len(data), data)
-        header[HEAD_AT] = head + 1
-
-    return frame
-
-
 class Recorder:
     """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick.
 
@@ -98,7 +79,6 @@ class Recorder:
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
-        self.frame: FramePacker = frame_packer(self._frames)
         self._record, self._record_bytes = new_ticks(), memoryview(b"")
         self._failed = self._closed = False
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
@@ -164,6 +144,10 @@ class Recorder:
         if tick is not self._record:
             self._record, self._record_bytes = tick, tick.view("u1").data
         self._ticks.push(self._record_bytes)
+
+    def frames(self, records: memoryview) -> None:
+        """Store raw CAN frames, as bytes of :data:`hil.log.schema.FRAME` records."""
+        self._frames.push_many(records)
 
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Store one event; the text is cut to what a record holds."""

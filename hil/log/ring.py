@@ -73,10 +73,21 @@ class Ring:
         header[HEAD_AT] = head + 1
         return True
 
-    @property
-    def memory(self) -> memoryview:
-        """All of the ring; a producer that packs in place writes the record, then the head."""
-        return self._bytes
+    def push_many(self, records: memoryview) -> None:
+        """Store whole records; those that there is no room for, the newest, are dropped."""
+        header, size = self.header, self.record_size
+        head, count = header[HEAD_AT], len(records) // size
+        room = self.capacity - head + header[TAIL_AT]
+        if count > room:
+            header[DROPPED_AT] += count - room
+            count = room
+        first = head % self.capacity
+        at, end = HEADER_BYTES + first * size, count * size
+        cut = min(end, (self.capacity - first) * size)
+        self._bytes[at : at + cut] = records[:cut]
+        if cut < end:
+            self._bytes[HEADER_BYTES : HEADER_BYTES + end - cut] = records[cut:end]
+        header[HEAD_AT] = head + count
 
     def take(self, *, final: bool = False) -> bytes:
         """Return the records published before the previous look, whole; with ``final`` all there are."""

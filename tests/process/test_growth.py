@@ -45,7 +45,7 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
     recorder = Recorder(tmp_path / "run.mcap", header_of(setup, "run", "lockstep"), 2000)
     settings = BusSettings("hil-local", channel)
     peer, link = open_link(settings), open_link(settings)
-    client = DriveClient(link, setup.database, on_frame=recorder.frame)
+    client = DriveClient(link, setup.database, on_frames=recorder.frames)
     feedback = setup.database.message("FEEDBACK")
     answers = [feedback.encode({"Counter": k, "State": 1}) for k in range(16)]
     seen: list[tuple[int, int]] = []

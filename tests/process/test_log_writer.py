@@ -19,6 +19,7 @@ from hil.log.container import MAGIC
 from hil.log.errors import LogError
 from hil.log.reader import open_log
 from hil.log.recorder import RING_SECONDS, Recorder, check_folder, open_recorder
+from hil.log.records import FRAME_RECORD
 from hil.log.ring import FAILED_AT, attach
 from hil.signals import TICK, TickArray, new_ticks
 from tests.logfiles import HEADER, some_ticks
@@ -58,8 +59,9 @@ def test_a_run_is_recorded_whole(tmp_path: Path) -> None:
     path, ticks = tmp_path / "run.mcap", some_ticks(1500)
     with recording(path) as recorder:
         push(recorder, ticks[:700], 0.001)
-        recorder.frame(True, 5, 0x181, b"\x01\x02")
-        recorder.frame(False, 6, 0x201, bytes(range(64)))
+        frames = [(True, 5, 0x181, b"\x01\x02"), (False, 6, 0x201, bytes(range(64)))]
+        records = [FRAME_RECORD.pack(t, can_id, rx, len(data), data) for rx, t, can_id, data in frames]
+        recorder.frames(memoryview(b"".join(records)))
         recorder.event(7, 3, "state", "OPERATION_ENABLED")
         push(recorder, ticks[700:])
         assert not recorder.failed
@@ -81,6 +83,7 @@ def test_a_run_is_recorded_whole(tmp_path: Path) -> None:
 CONTROLLER = """
 import sys, time
 from pathlib import Path
+from hil.log.records import FRAME_RECORD
 from hil.log.recorder import Recorder
 from tests.logfiles import HEADER, some_ticks
 recorder = Recorder(Path(sys.argv[1]), HEADER, 1000)

@@ -31,13 +31,21 @@ def numbers(raw: bytes) -> list[int]:
 
 @given(
     capacity=st.integers(1, 7),
-    steps=st.lists(st.one_of(st.integers(1, 9), st.sampled_from(["take", "final"])), max_size=40),
+    steps=st.lists(
+        st.one_of(st.integers(-9, -1), st.integers(1, 9), st.sampled_from(["take", "final"])), max_size=40
+    ),
 )
 def test_the_ring_is_a_queue_that_drops_when_full(capacity: int, steps: list[int | str]) -> None:
     ring = Ring.create("test", SIZE, capacity)
     queue: deque[int] = deque()
     dropped, pushed, seen = 0, 0, 0
     for step in steps:
+        if isinstance(step, int) and step < 0:  # many at once
+            ring.push_many(memoryview(b"".join(record(pushed + n) for n in range(-step))))
+            kept = min(-step, capacity - len(queue))
+            queue.extend(range(pushed, pushed + kept))
+            dropped, pushed = dropped - step - kept, pushed - step
+            continue
         if isinstance(step, int):
             for _ in range(step):
                 kept = ring.push(record(pushed))

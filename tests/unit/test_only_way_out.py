@@ -17,8 +17,8 @@ from tests.conftest import CONFIGS, ROOT
 
 # (file, function): every place outside the links themselves that hands a frame to a link
 MAY_SEND = {
-    ("drivers/client.py", "_send"),  # what `send` and `stop` encode from a guarded tick, and SYNC
-    ("drivers/client.py", "_send_raw"),  # the same, already packed
+    ("drivers/client.py", "_transmit"),  # what `send` and `stop` lay out from a guarded tick, and SYNC
+    ("drivers/rawlink.py", "send_raw"),  # passes on what the client sends
     ("drivers/lockstep.py", "send"),  # passes on what the client sends
     ("hil/app.py", "sending_bus"),  # hil play: recorded frames, onto emulated buses unless allowed
 }

@@ -1,0 +1,55 @@
+"""How kernels of the wire and of the emulator are compiled; neither imports the controller."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+from numba.core import config as numba_config
+
+config: Any = numba_config  # its attributes are made at run time
+config.CPU_NAME = "generic"
+config.CPU_FEATURES = ""
+
+
+def cache_folder(root: Path) -> Path:
+    """Folder of compiled kernels for exactly this source.
+
+    numba looks at the file of a function, not at those of the functions that it calls; a digest of all
+    sources keeps it from running an old callee inside a new caller.
+    """
+    digest = hashlib.sha256()
+    for package in ("hil", "drivers", "firmware_model"):
+        for path in sorted((root / package).rglob("*.py")):
+            digest.update(path.read_bytes())
+    base = Path(os.environ.get("NUMBA_CACHE_DIR") or root / ".cache" / "numba")
+    return base / digest.hexdigest()[:16]
+
+
+config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[1]))
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def jit(function: Function) -> Function:
+    """Compile with numba at the first call: exact IEEE arithmetic, generic processor, cached on disk."""
+    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+def entry(kernel: Function, *example: Any) -> Function:
+    """The compiled form of ``kernel`` for arguments of the types of ``example``, which is called once.
+
+    numba finds the form by the arguments' types at every call, which for records takes longer than the
+    kernel. The result does not look: it must be given arguments of those very types. With the compiler off
+    it is the kernel itself.
+    """
+    kernel(*example)
+    forms: Any = getattr(kernel, "overloads", None)
+    if forms is None:
+        return kernel
+    types: Any = numba.typeof
+    return cast(Function, forms[tuple(types(argument) for argument in example)].entry_point)

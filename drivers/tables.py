@@ -1,0 +1,96 @@
+"""A binding as tables for the kernels of :mod:`drivers.wire`."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.binding import Binding, Bound
+from drivers.frames import SOURCES, STATUS
+from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
+from drivers.mapping import MEASURED, RECEIVED
+from drivers.signal import Signal
+from drivers.wire import FD_BYTES, MESSAGE, SIGNAL, STATE_RAW
+
+Records = npt.NDArray[np.void]
+Row = tuple[Signal, int, int, int, bool]
+"""A signal with offset and kind of its field of the tick, its place in a command's values, and wholeness."""
+_KINDS: Final = {"<f8": 0, "<u4": 1, "<u8": 2, "<i4": 3, "<i8": 4}
+
+
+class Tables:
+    """Messages of one direction and their signals, each message's together, its counter first."""
+
+    def __init__(self) -> None:
+        self._messages: list[tuple[Any, ...]] = []
+        self._signals: list[tuple[Any, ...]] = []
+
+    def add(self, bound: Bound, rows: list[Row], bit: int = 0, seen: int = 0) -> None:
+        """Add a message with its signals."""
+        message, first = bound.message, len(self._signals)
+        if bound.counter:
+            rows = [(message.signals[bound.counter], 0, 0, 0, True), *rows]
+        for one, at, kind, source, whole in rows:
+            low, high = (one.minimum, one.maximum) if one.is_float else one.raw_range()
+            self._signals.append(
+                (at, kind, source, one.shift, one.length, one.big_endian, one.signed, one.is_float, whole,
+                 one.scale, one.offset, float(low), float(high))
+            )  # fmt: skip
+        ids = np.frombuffer(message.data_ids.ljust(16, b"\0"), "u1")
+        modulus = bound.counter_modulus if bound.counter else 0
+        self._messages.append(
+            (message.send_id, message.length, message.profile, ids, modulus, first, len(rows), bit, seen,
+             message.fd)
+        )  # fmt: skip
+
+    def records(self) -> tuple[Records, Records]:
+        """(messages, signals) as the kernels take them."""
+        return np.array(self._messages, MESSAGE), np.array(self._signals, SIGNAL)
+
+
+def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records, Records, int]:
+    """(messages, signals, bits of all that measure) for :func:`drivers.wire.take` into records ``tick``."""
+    tables, needed = Tables(), 0
+    for index, bound in enumerate(binding.incoming):
+        parts = {part for part, _ in bound.parts}
+        bit = 1 << index if parts & set(MEASURED) else 0
+        needed |= bit
+        rows = [
+            (bound.message.signals[name], *field_in(tick, RECEIVED[part].field), 0, not RECEIVED[part].units)
+            for part, name in bound.parts
+        ]
+        seen = STATUS if not bit and "v_dc" in parts else 0
+        tables.add(bound, rows, bit, seen | (STATE_RAW if "state" in parts and binding.map.states else 0))
+    return *tables.records(), needed
+
+
+def field_in(tick: np.dtype[np.void], name: str) -> tuple[int, int]:
+    """(offset, kind) of a field of the tick. Raises TypeError for a kind that no kernel writes."""
+    kind, offset = tick.fields[name][:2]  # type: ignore[index]
+    if kind.str not in _KINDS:
+        raise TypeError(f"field {name} of the tick is {kind.str}; kernels write {', '.join(_KINDS)}")
+    return int(offset), _KINDS[kind.str]
+
+
+def outgoing_tables(binding: Binding) -> tuple[Records, Records, list[float]]:
+    """(messages, signals, constants) for :func:`drivers.wire.encode`; the constants follow the values."""
+    tables = Tables()
+    constants: list[float] = []
+    for bound in binding.outgoing:
+        signals = bound.message.signals
+        rows = [(signals[name], 0, 0, SOURCES.index(part), False) for part, name in bound.parts]
+        for name, value in bound.constants:
+            rows.append((signals[name], 0, 0, len(SOURCES) + len(constants), False))
+            constants.append(value)
+        tables.add(bound, rows)
+    return *tables.records(), constants
+
+
+def laid_out(send_id: int, length: int, fd: bool) -> npt.NDArray[np.uint8]:
+    """A buffer with the head of a frame to send; its data are 0."""
+    buffer = np.zeros(FD_BYTES, np.uint8)
+    head = FD.pack(send_id, length, FD_FDF | FD_BRS, b"") if fd else CLASSIC.pack(send_id, length, b"")
+    buffer[: len(head)] = np.frombuffer(head, np.uint8)
+    return buffer

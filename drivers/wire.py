@@ -1,0 +1,343 @@
+"""Frames to and from a tick as two compiled kernels over tables: what :mod:`drivers.tables` made of a DBC.
+
+A frame arrives as the bytes of SocketCAN's layout in a buffer. :func:`take` knows it by identifier and
+length, checks CRC and counter and writes its signals to the tick; :func:`encode` lays out a command for the
+socket. A tick spends most of its time between sockets and tick, and an interpreter pays for every step of it.
+The rules are those of :mod:`drivers.signal` and :mod:`drivers.e2e`; equality with the codec is tested.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.e2e import CRC8_TABLE
+from drivers.frames import (
+    COUNTER_JUMP,
+    COUNTER_REPEATED,
+    CRC_ERROR,
+    FRESH,
+    LENGTH_ERROR,
+)
+from drivers.jit import jit
+
+STATE_RAW: Final = 1 << 16
+"""What :func:`take` flags when the state that it wrote to the tick is the drive's own, to be translated."""
+UNKNOWN: Final = -1
+"""What :func:`take` returns for a frame of no message in the tables."""
+REFUSED: Final = -1
+"""What :func:`encode` returns for a value that a signal can't carry."""
+CLASSIC_BYTES: Final = 16
+FD_BYTES: Final = 72
+DATA_AT: Final = 8
+FLOAT32_END: Final = (2.0 - 2.0**-24) * 2.0**127
+"""Magnitude from which on a number rounds to infinity in 32 bits."""
+ROOM: Final = 512
+"""Frames that one tick can log before they are handed on."""
+
+F8, U4, U8, I4, I8 = range(5)
+SIGNAL: Final = np.dtype(
+    [
+        ("at", "i8"), ("kind", "i8"), ("source", "i8"), ("shift", "i8"), ("bits", "i8"),
+        ("big", "?"), ("signed", "?"), ("real", "?"), ("whole", "?"),
+        ("scale", "f8"), ("offset", "f8"), ("low", "f8"), ("high", "f8"),
+    ],
+    align=True,
+)  # fmt: skip
+"""``at``: offset of the tick's field; ``source``: place in a command's values; ``low``, ``high``: raw, or
+physical for a float."""
+MESSAGE: Final = np.dtype(
+    [
+        ("id", "i8"), ("length", "i8"), ("profile", "i8"), ("ids", "u1", (16,)), ("modulus", "i8"),
+        ("first", "i8"), ("count", "i8"), ("bit", "i8"), ("seen", "i8"), ("fd", "?"),
+    ],
+    align=True,
+)  # fmt: skip
+"""``modulus`` 0: no counter, else the first signal is one. ``bit``: of a message that measures, 0 for slow
+values; ``seen``: what a good frame is flagged with besides."""
+STATE: Final = np.dtype(
+    [("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("last_sent", "i8"), ("logged", "i8")]
+)
+"""``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has."""
+FRAME: Final = np.dtype(
+    [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
+)
+"""A frame as it is logged."""
+
+_CRC8: Final = np.frombuffer(CRC8_TABLE, np.uint8).astype(np.int64)
+
+
+@jit
+def crc_16(crc: int, byte: int) -> int:
+    """One byte of CRC-16 with polynomial 0x1021."""
+    crc ^= byte << 8
+    for _ in range(8):
+        crc = ((crc << 1) ^ 0x1021) & 0xFFFF if crc & 0x8000 else (crc << 1) & 0xFFFF
+    return crc
+
+
+@jit
+def crc_of(raw: Any, m: Any) -> int:
+    """CRC of a frame's data by its message's profile."""
+    end = DATA_AT + m["length"]
+    if m["profile"] == 2:
+        crc = 0xFF
+        for index in range(DATA_AT + 1, end):
+            crc = _CRC8[crc ^ int(raw[index])]
+        return int(_CRC8[crc ^ int(m["ids"][int(raw[DATA_AT + 1]) & 15])]) ^ 0xFF
+    crc = 0xFFFF
+    for index in range(DATA_AT + 2, end):
+        crc = crc_16(crc, int(raw[index]))
+    return crc_16(crc_16(crc, int(m["ids"][1])), int(m["ids"][0]))
+
+
+@jit
+def is_valid(raw: Any, m: Any) -> bool:
+    """Is the CRC right?"""
+    if m["profile"] == 0:
+        return True
+    crc = crc_of(raw, m)
+    if m["profile"] == 2:
+        return int(raw[DATA_AT]) == crc
+    return (int(raw[DATA_AT]) | int(raw[DATA_AT + 1]) << 8) == crc
+
+
+@jit
+def halves(raw: Any, length: int, g: Any) -> tuple[int, int]:
+    """Bits of a signal as (low 32, the rest)."""
+    low, high, done = 0, 0, 0
+    while done < g["bits"]:
+        place = g["shift"] + done
+        byte = place >> 3
+        if g["big"]:
+            byte = length - 1 - byte
+        inside = place & 7
+        part = (int(raw[DATA_AT + byte]) >> inside) & 0xFF
+        room = min(8 - inside, g["bits"] - done)
+        part &= (1 << room) - 1
+        if done < 32:
+            low |= part << done
+        else:
+            high |= part << (done - 32)
+        done += room
+    return low & 0xFFFFFFFF, high | low >> 32
+
+
+@jit
+def real_of(low: int, high: int, bits: int, words: Any) -> float:
+    """IEEE number of 16, 32 or 64 bits. ``words``: scratch of two uint32."""
+    if bits == 16:
+        exponent, fraction = (low >> 10) & 31, low & 1023
+        sign = -1.0 if low & 0x8000 else 1.0
+        if exponent == 31:
+            return sign * np.inf if fraction == 0 else np.nan
+        if exponent == 0:
+            return sign * fraction * 2.0**-24
+        return sign * (1024 + fraction) * 2.0 ** (exponent - 25)
+    words[0], words[1] = low, high
+    if bits == 32:
+        return float(words.view(np.float32)[0])
+    return float(words.view(np.float64)[0])
+
+
+@jit
+def phys_of(raw: Any, length: int, g: Any, words: Any) -> Any:
+    """Physical value of a signal: raw * scale + offset."""
+    low, high = halves(raw, length, g)
+    if g["real"]:
+        return real_of(low, high, g["bits"], words) * g["scale"] + g["offset"]
+    if g["signed"]:
+        if g["bits"] <= 32:
+            low -= (low >> (g["bits"] - 1)) << g["bits"]
+        else:
+            high -= (high >> (g["bits"] - 33)) << (g["bits"] - 32)
+    return (high * 4294967296.0 + low) * g["scale"] + g["offset"]
+
+
+@jit
+def put(tick: Any, g: Any, value: float) -> None:
+    """Write a value to its field of the tick; a whole one that the field can't hold is cut to its range."""
+    at = g["at"]
+    if g["kind"] == F8:
+        tick[at : at + 8].view(np.float64)[0] = value
+        return
+    whole = np.rint(value) if g["whole"] else value
+    if g["kind"] == U4:
+        tick[at : at + 4].view(np.uint32)[0] = int(min(max(whole, 0.0), 4294967295.0))
+    elif g["kind"] == I4:
+        tick[at : at + 4].view(np.int32)[0] = int(min(max(whole, -2147483648.0), 2147483647.0))
+    else:
+        tick[at : at + 8].view(np.int64)[0] = int(min(max(whole, 0.0), 9.0e18))
+
+
+@jit
+def note(log: Any, s: Any, raw: Any, received: int, t_ns: int) -> None:
+    """Write a frame to the next place of the log, which counts once ``logged`` goes on."""
+    entry = log[s["logged"]]
+    entry["t_ns"], entry["received"], entry["size"] = t_ns, received, min(int(raw[4]), 64)
+    entry["can_id"] = int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
+    for index in range(min(int(raw[4]), 64)):
+        entry["data"][index] = raw[DATA_AT + index]
+
+
+@jit
+def note_sent(log: Any, state: Any, raw: Any, t_ns: int) -> int:
+    """:func:`note` for a frame that stands in its buffer."""
+    if len(log) > 0:
+        note(log, state[0], raw, 0, t_ns)
+    return 0
+
+
+@jit
+def find(raw: Any, messages: Any) -> int:
+    """Place of a frame's message by its identifier, -1 for none."""
+    can_id = int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
+    for index in range(len(messages)):
+        if messages[index]["id"] == can_id:
+            return index
+    return -1
+
+
+@jit
+def judge(raw: Any, m: Any, last: Any, index: int, signals: Any, words: Any) -> int:
+    """Flags of a frame's counter against the last one's."""
+    if m["modulus"] == 0:
+        return FRESH
+    counter = int(phys_of(raw, m["length"], signals[m["first"]], words))
+    before = last[index]
+    last[index] = counter
+    if counter == before:
+        return COUNTER_REPEATED
+    return FRESH if before < 0 or counter == (before + 1) % m["modulus"] else FRESH | COUNTER_JUMP
+
+
+@jit
+def complete(s: Any, m: Any, tick: Any, flags: int) -> Any:
+    """Flags of a measuring message: fresh once all of this tick's have come."""
+    s["got"] |= m["bit"]
+    if s["got"] != s["needed"]:
+        return flags & ~FRESH
+    s["got"] = 0
+    if s["echo_at"] >= 0:
+        tick[s["echo_at"] : s["echo_at"] + 4].view(np.uint32)[0] = s["last_sent"]
+    return flags
+
+
+@jit
+def take(
+    raw: Any, messages: Any, signals: Any, last: Any, state: Any, words: Any, tick: Any, log: Any,
+    size: int, late: bool, t_ns: int,
+) -> Any:  # fmt: skip
+    """Check a frame of ``size`` bytes on the socket and apply it to the tick, whole or not at all.
+
+    ``late``: the frame is checked and counted; a measurement is not applied. ``last``: each message's last
+    counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, or UNKNOWN.
+    """
+    s = state[0]
+    if int(raw[4]) > size - DATA_AT:
+        return 0
+    if len(log) > 0:
+        note(log, s, raw, 1, t_ns)
+        s["logged"] += 1
+    index = find(raw, messages)
+    if index < 0:
+        return UNKNOWN
+    m = messages[index]
+    if int(raw[4]) != m["length"] or (size == CLASSIC_BYTES and m["length"] > 8):
+        return LENGTH_ERROR
+    if not is_valid(raw, m):
+        return CRC_ERROR
+    flags = judge(raw, m, last, index, signals, words)
+    if not flags & FRESH or (late and m["bit"] != 0):
+        return flags & ~FRESH
+    first = m["first"] + (1 if m["modulus"] > 0 else 0)
+    for place in range(first, m["first"] + m["count"]):
+        put(tick, signals[place], phys_of(raw, m["length"], signals[place], words))
+    if m["bit"] == 0:
+        return (flags & ~FRESH) | m["seen"]
+    return complete(s, m, tick, flags) | m["seen"]
+
+
+@jit
+def raw_of(g: Any, value: float) -> Any:
+    """Raw number of a physical value, NaN where it does not fit. As :meth:`drivers.signal.Signal.to_bits`."""
+    if not np.isfinite(value):
+        return np.nan
+    number = (value - g["offset"]) / g["scale"]
+    if g["real"]:
+        return number if g["bits"] != 16 and g["low"] <= value <= g["high"] else np.nan
+    number = np.rint(number)
+    return number if g["low"] <= number <= g["high"] else np.nan
+
+
+@jit
+def lay(raw: Any, length: int, g: Any, number: float, words: Any) -> bool:
+    """Put a raw number's bits into a zeroed frame; False when it overflows a float of 32 bits."""
+    if g["real"]:
+        if g["bits"] == 32:
+            if abs(number) >= FLOAT32_END:
+                return False
+            words.view(np.float32)[0] = number
+        else:
+            words.view(np.float64)[0] = number
+        low, high = int(words[0]), int(words[1])
+    else:
+        high_part = np.floor(number / 4294967296.0)
+        low, high = int(number - high_part * 4294967296.0), int(high_part)
+    done = 0
+    while done < g["bits"]:
+        place = g["shift"] + done
+        byte = place >> 3
+        if g["big"]:
+            byte = length - 1 - byte
+        inside = place & 7
+        room = min(8 - inside, g["bits"] - done)
+        if done < 32:
+            part = low >> done
+            if done + room > 32:
+                part |= high << (32 - done)
+        else:
+            part = high >> (done - 32)
+        part &= (1 << room) - 1
+        raw[DATA_AT + byte] = int(raw[DATA_AT + byte]) | part << inside
+        done += room
+    return True
+
+
+@jit
+def encode(
+    raw: Any,
+    values: Any,
+    index: int,
+    messages: Any,
+    signals: Any,
+    state: Any,
+    words: Any,
+    log: Any,
+    t_ns: int,
+) -> int:
+    """Lay a command out in ``raw``, whose first eight bytes stand; return its size on the socket or REFUSED.
+
+    ``values``: counter, then what :data:`drivers.frames.SOURCES` names, then the constants. The frame is
+    noted in the log as sent at ``t_ns``; it counts once the caller says that it was.
+    """
+    m = messages[index]
+    for at in range(DATA_AT, DATA_AT + m["length"]):
+        raw[at] = 0
+    for place in range(m["first"], m["first"] + m["count"]):
+        g = signals[place]
+        value = values[g["source"]]
+        if place == m["first"] and m["modulus"] > 0:
+            value = value % m["modulus"]
+        number = raw_of(g, value)
+        if np.isnan(number) or not lay(raw, m["length"], g, number, words):
+            return REFUSED
+    if m["profile"] == 2:
+        raw[DATA_AT] = crc_of(raw, m)
+    elif m["profile"] == 5:
+        crc = crc_of(raw, m)
+        raw[DATA_AT], raw[DATA_AT + 1] = crc & 0xFF, crc >> 8
+    if len(log) > 0:
+        note(log, state[0], raw, 0, t_ns)
+    return FD_BYTES if m["fd"] else CLASSIC_BYTES
