@@ -449,7 +449,7 @@ def _run_armed(
     request: StopRequest,
 ) -> RunResult:
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
-    loop = Loop(drive, clock, recorder, machine.prepare, machine.step, new_ticks(), plan, request)
+    loop = Loop(drive, clock, recorder, machine.looped(), new_ticks(), plan, request)
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
 
 from hil.config import ChannelTable, LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.control.jit import entry
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
 from hil.guard import SAFETY_PARAMS
-from hil.kernel import new_safety_state, prepare, step
+from hil.kernel import new_safety_state, prepare, step, whole
 from hil.signals import TickArray, new_ticks
 
 CYCLIC_ECHO_LAG = 3
@@ -52,6 +55,13 @@ class Machine:
     def step(self, ticks: TickArray) -> None:
         """Run one tick."""
         step(self.safety, self.safety_state, self.law, self.law_state, ticks)
+
+    def looped(self) -> Callable[[TickArray], None]:
+        """:meth:`prepare` and :meth:`step` as one compiled call, for a loop's tick."""
+        other = self.fresh()
+        example = (other.reference, other.safety, other.safety_state, other.law, other.law_state, new_ticks())
+        own = (self.reference, self.safety, self.safety_state, self.law, self.law_state)
+        return partial(entry(whole, *example), *own)
 
     def fresh(self) -> Machine:
         """The same controller before its first tick."""

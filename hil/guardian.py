@@ -26,7 +26,7 @@ from typing import Any, Protocol
 from hil.clock import RealClock
 from hil.errors import HilError
 from hil.ports import Drive
-from hil.signals import DriveState, RxFlag
+from hil.signals import DriveState, RxFlag, cell
 
 GUARDIAN_LOST_NS = 500_000_000
 """Age of the guardian's own heartbeat at which the controller stops the run."""
@@ -43,6 +43,12 @@ class Word(IntEnum):
     COUNTER = 2
     FIRED = 3
     GUARD_NS = 4
+
+
+# plain numbers for the tick: a member of an enumeration costs more to look up than the word to store
+ARMED, BEAT_NS, COUNTER, FIRED, GUARD_NS = map(int, Word)
+DISARMED = int(DriveState.SWITCH_ON_DISABLED)
+GUARDIAN, GUARDIAN_LOST = int(RxFlag.GUARDIAN), int(RxFlag.GUARDIAN_LOST)
 
 
 class Stopper(Protocol):
@@ -63,39 +69,51 @@ class GuardedDrive:
     """A drive port that tells the guardian of each tick; nothing is sent once the guardian has fired."""
 
     def __init__(self, drive: Drive, words: Words, now: Callable[[], int]) -> None:
-        self._drive, self._cells, self._now = drive, words.cells, now
-        self._fired, self._beat, self._counter = int(Word.FIRED), int(Word.BEAT_NS), int(Word.COUNTER)
+        self._drive, self._words, self._now = drive, words.cells, now
+        self._tick: Any = None
+
+    def _bind(self, tick: Any) -> None:
+        """Reach the fields of this tick; the loop hands in the same one each time."""
+        self._flags, self._state, self._counter = (
+            cell(tick.base, name) for name in ("rx_flags", "state", "counter")
+        )
+        self._tick = tick
 
     def sync(self, tick: Any) -> None:
         """SYNC, unless the guardian has stopped the drive."""
-        self._cells[self._beat] = self._now()
-        if not self._cells[self._fired]:
+        words = self._words
+        words[BEAT_NS] = self._now()
+        if not words[FIRED]:
             self._drive.sync(tick)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Feedback, and what the guardian did."""
+        if tick is not self._tick:
+            self._bind(tick)
         self._drive.receive(tick, deadline_ns)
-        cells = self._cells
-        if cells[self._fired]:
-            tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.GUARDIAN)
-        elif self._now() - cells[Word.GUARD_NS] > GUARDIAN_LOST_NS:
-            tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.GUARDIAN_LOST)
+        words = self._words
+        if words[FIRED]:
+            self._flags[0] |= GUARDIAN
+        elif self._now() - words[GUARD_NS] > GUARDIAN_LOST_NS:
+            self._flags[0] |= GUARDIAN_LOST
 
     def send(self, tick: Any) -> None:
         """The command. Raises OSError once the guardian has stopped the drive; the record stays as it is."""
-        cells = self._cells
-        cells[self._beat] = self._now()
-        cells[Word.ARMED] = int(tick["state"] != DriveState.SWITCH_ON_DISABLED)
-        cells[self._counter] = int(tick["counter"])
-        if cells[self._fired]:
+        if tick is not self._tick:
+            self._bind(tick)
+        words = self._words
+        words[BEAT_NS] = self._now()
+        words[ARMED] = self._state[0] != DISARMED
+        words[COUNTER] = self._counter[0]
+        if words[FIRED]:
             raise OSError(errno.ECANCELED, "the guardian has stopped the drive")
         self._drive.send(tick)
 
     def stop(self) -> None:
         """The controller's own stop frames; the guardian watches until they are out."""
-        if not self._cells[self._fired]:
+        if not self._words[FIRED]:
             self._drive.stop()
-        self._cells[Word.ARMED] = 0
+        self._words[ARMED] = 0
 
     def close(self) -> None:
         """Release the bus."""

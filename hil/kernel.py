@@ -125,3 +125,10 @@ def prepare(rp: Any, ss: Any, lp: Any, ticks: Any) -> None:
     w_ref, dw_ref = reference_at(rp[0], s["run_ticks"] * lp[0]["T_s"])
     t["w_ref"], t["dw_ref"] = w_ref, dw_ref
     t["i_q_ref_in"] = rp[0]["i_q"] if lp[0]["kind"] == FAC else 0.0
+
+
+@jit
+def whole(rp: Any, sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
+    """:func:`prepare` and :func:`step`: a tick of a loop, which has no logged reference to take."""
+    prepare(rp, ss, lp, ticks)
+    step(sp, ss, lp, ls, ticks)

@@ -28,6 +28,15 @@ QUEUE_MOST = 4096
 ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 
 
+STOP, BUS_DOWN, SEND_FAILED = int(Request.STOP), int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
+NEVER = 2**63
+
+
+def bounded(ns: int) -> int:
+    """A stamp as the record holds it."""
+    return ns if -MAX_NS <= ns <= MAX_NS else (MAX_NS if ns > 0 else -MAX_NS)
+
+
 class StopRequest:
     """What the operator asks: nothing, a stop (first Ctrl-C, SIGTERM) or a quick stop (second)."""
 
@@ -89,15 +98,15 @@ class Loop:
         drive: Drive,
         clock: Clock,
         recorder: Recorder,
-        prepare: Step,
         step: Step,
         ticks: TickArray,
         plan: Plan,
         request: StopRequest,
     ) -> None:
         self._drive, self._clock, self._recorder = drive, clock, recorder
-        self._prepare, self._step = prepare, step
-        self._ticks, self._plan, self._request = ticks, plan, request
+        self._step, self._ticks, self._plan, self._request = step, ticks, plan, request
+        self._end = NEVER if plan.ticks is None else plan.ticks
+        self._sends_sync = plan.pacing == "sync"
         self._cells: Any = Cells(ticks)
         self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
         self._arrived_ns = 0
@@ -141,26 +150,27 @@ class Loop:
         now, t = self._clock.now_ns, self._cells
         self._stamp(k, deadline_ns, gap, now_ns)
         t.rx_flags[0] = 0
-        if self._plan.pacing == "feedback":
-            k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
-        else:
+        if self._sends_sync:
             self._exchange(tick, deadline_ns)
-        t.received_ns[0] = min(now() - deadline_ns, MAX_NS)
+        elif self._plan.pacing == "timer":
+            self._drive.receive(tick, 0)
+        else:
+            k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
+        t.received_ns[0] = bounded(now() - deadline_ns)
         if self._plan.pacing == "timer":
             self._note_age(deadline_ns)
-        self._prepare(self._ticks)
         self._step(self._ticks)
-        t.computed_ns[0] = min(now() - deadline_ns, MAX_NS)
+        t.computed_ns[0] = bounded(now() - deadline_ns)
         if t.send[0]:
             self._send(tick)
-        t.sent_ns[0] = min(now() - deadline_ns, MAX_NS)
+        t.sent_ns[0] = bounded(now() - deadline_ns)
         if t.rx_flags[0] & TROUBLE:
             self._trouble.note(deadline_ns, k, t.rx_flags[0])
         if t.state[0] != self._state:
             self._state = t.state[0]
             self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))
         self._recorder.tick(self._ticks)
-        t.recorded_ns[0] = min(now() - deadline_ns, MAX_NS)
+        t.recorded_ns[0] = bounded(now() - deadline_ns)
         return k
 
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
@@ -214,30 +224,19 @@ class Loop:
         t.t_ns[0] = deadline_ns
         t.gap[0] = gap
         t.skipped[0] = gap - 1
-        t.lateness_ns[0] = max(min(now_ns - deadline_ns, MAX_NS), -MAX_NS)
-        t.request[0] = self._requested(k)
+        t.lateness_ns[0] = bounded(now_ns - deadline_ns)
+        asked = self._request.value
+        t.request[0] = asked if k < self._end else max(STOP, asked)
         t.log_failed[0] = self._recorder.failed
 
-    def _requested(self, k: int) -> int:
-        """The operator's request; at the end of the planned length, a stop."""
-        if self._plan.ticks is not None and k >= self._plan.ticks:
-            return max(int(Request.STOP), self._request.value)
-        return self._request.value
-
     def _exchange(self, tick: Any, deadline_ns: int) -> None:
-        """SYNC out and feedback in (sync), or what has come (timer)."""
-        plan, drive = self._plan, self._drive
-        if plan.pacing == "timer":
-            drive.receive(tick, 0)
+        """SYNC out and feedback in."""
+        try:
+            self._drive.sync(tick)
+        except OSError as error:
+            self._cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
             return
-        if plan.pacing == "sync":
-            try:
-                drive.sync(tick)
-            except OSError as error:
-                kind = RxFlag.SEND_FAILED if error.errno in FULL else RxFlag.BUS_DOWN
-                self._cells.rx_flags[0] |= int(kind)
-                return
-            drive.receive(tick, self._clock.receive_deadline(deadline_ns, plan.timeout_ns))
+        self._drive.receive(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
 
     def _send(self, tick: Any) -> None:
         """Send the command; a bus that does not take it is seen by the supervisor in the next tick."""

@@ -42,3 +42,18 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def jit(function: Function) -> Function:
     """Compile ``function`` with numba at its first call."""
     return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+
+
+def entry(kernel: Function, *example: Any) -> Function:
+    """The compiled form of ``kernel`` for arguments of the types of ``example``, which is called once.
+
+    numba finds the form by the arguments' types at every call, which for records takes longer than a tick's
+    arithmetic. The result does not look: it must be given arguments of those very types. With the compiler
+    off it is the kernel itself.
+    """
+    kernel(*example)
+    forms: Any = getattr(kernel, "overloads", None)
+    if forms is None:
+        return kernel
+    types: Any = numba.typeof
+    return cast(Function, forms[tuple(types(argument) for argument in example)].entry_point)

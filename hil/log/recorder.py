@@ -24,6 +24,8 @@ __all__ = ["BYTES_PER_TICK", "LogError", "Recorder", "check_folder", "open_recor
 RING_SECONDS: Final = 4
 FRAMES_PER_TICK: Final = 5
 BYTES_PER_TICK: Final = TICK.itemsize + 31 + 4 * 60
+LOOK_EVERY: Final = 16
+"""Ticks between two looks at the writer's heartbeat; its word is looked at in each."""
 LOOK_NS: Final = 100_000_000
 WRITER_SILENT_NS: Final = 2_000_000_000
 START_TIMEOUT_S: Final = 20.0
@@ -81,6 +83,7 @@ class Recorder:
         self._events = Ring.create("events", EVENT_BYTES, 1024)
         self._record, self._record_bytes = new_ticks(), memoryview(b"")
         self._failed = self._closed = False
+        self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
         self._writer = self._spawn()
         try:
@@ -128,7 +131,14 @@ class Recorder:
         """
         if self._failed or self._closed:
             return self._failed
-        header = self._ticks.header
+        self._looks -= 1
+        if self._looks <= 0 or self._ticks.header[FAILED_AT]:
+            self._look()
+        return self._failed
+
+    def _look(self) -> None:
+        """Look at the writer's word, its heartbeat and whether it lives."""
+        header, self._looks = self._ticks.header, LOOK_EVERY
         beat, now_ns = header[BEAT_AT], time.monotonic_ns()
         if header[FAILED_AT]:
             self._failed = True
@@ -137,7 +147,6 @@ class Recorder:
         elif now_ns - max(self._beat_ns, self._look_ns) > LOOK_NS:
             self._look_ns = now_ns
             self._failed = self._writer.poll() is not None or now_ns - self._beat_ns > WRITER_SILENT_NS
-        return self._failed
 
     def tick(self, tick: TickArray) -> None:
         """Store one tick."""

@@ -49,18 +49,19 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
     feedback = setup.database.message("FEEDBACK")
     answers = [feedback.encode({"Counter": k, "State": 1}) for k in range(16)]
     seen: list[tuple[int, int]] = []
+    looped = machine.looped()
     count = 0
 
     def step(array: TickArray) -> None:
         nonlocal count
-        machine.step(array)
+        looped(array)
         count += 1
         if count in (SETTLED, TICKS - 10):
             seen.append((gc.get_count()[0], sys.getallocatedblocks()))
 
     plan = Plan(1_000_000, 800_000, "sync", TICKS)
     drive = Answered(client, peer, answers)
-    loop = Loop(drive, LockstepClock(), recorder, machine.prepare, step, ticks, plan, StopRequest())
+    loop = Loop(drive, LockstepClock(), recorder, step, ticks, plan, StopRequest())
     gc.collect()
     gc.disable()
     try:

@@ -58,16 +58,9 @@ class Memory:
     def tick(self, tick: TickArray) -> None:
         self.ticks.append(tick.copy())
 
-    def frame(self, received: bool, t_ns: int, can_id: int, data: bytes) -> None:
-        raise AssertionError("the loop logs no frames itself")
-
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         self.events.append(kind)
         self.said.append((kind, k, text))
-
-
-def nothing(ticks: TickArray) -> None:
-    """Prepare nothing."""
 
 
 def obedient(ticks: TickArray) -> None:
@@ -84,7 +77,7 @@ def make(
 ) -> tuple[Loop, Memory, StopRequest]:
     memory, request = Memory(), StopRequest()
     plan = Plan(MS, MS * 6 // 10, pacing, ticks)
-    return Loop(drive, clock, memory, nothing, step, new_ticks(), plan, request), memory, request
+    return Loop(drive, clock, memory, step, new_ticks(), plan, request), memory, request
 
 
 def test_read_judge_compute_write_record_in_order() -> None:
