@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, NoReturn, Protocol
 
 import can
+import numpy as np
 
 from drivers.errors import LinkDown, LinkError, QueueFull
 from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, check_length, pack_frame
@@ -82,6 +83,8 @@ class SocketLink:
         self._bus, self._receiving, self._sending, self._fd = bus, receiving, sending, fd
         receiving.setblocking(False)
         self._fds = [receiving.fileno()]
+        self.fds = np.array([receiving.fileno(), sending.fileno(), 0, 0], np.int32)
+        """Receiving and sending descriptor for :mod:`drivers.posix`, and room for its poll."""
         poll = select.poll()
         poll.register(receiving, select.POLLIN)
         self._poll = poll.poll
@@ -148,6 +151,7 @@ class SocketLink:
     def close(self) -> None:
         """Close the bus."""
         self._fds, self._poll = [-1], _closed  # their number may be another file's by the next call
+        self.fds[:] = -1
         self._bus.shutdown()
 
 

@@ -7,6 +7,7 @@ nothing is sent until the client is closed.
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from typing import Any, Final, NoReturn
 import numpy as np
 
 from drivers.binding import Binding, bind
-from drivers.bus import RECEIVE_BYTES, Frame, Link, unpack_frame
+from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
 from drivers.codec import Database, Message
 from drivers.errors import EncodeError, LinkDown, LinkError, QueueFull
 from drivers.frames import (
@@ -32,6 +33,8 @@ from drivers.frames import (
 from drivers.jit import entry
 from drivers.local import CLASSIC, ERR_FLAG, FD
 from drivers.mapping import DriveMap, house_map
+from drivers.port import COMPILED, SocketPort
+from drivers.posix import FLAGS, MORE, PENDING, REFUSED_COMMAND, SEEN, SIZE
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
@@ -47,7 +50,10 @@ DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
 Send = Callable[[int], int]
-_GOT, _NEEDED, _ECHO_AT, _LAST_SENT, _LOGGED = range(5)
+_GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD = range(6)
+FLUSH_AT: Final = 64
+"""Frames that are handed on together: one tick has about four."""
+_SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
 
 
 class Outgoing:
@@ -80,7 +86,7 @@ class DriveClient:
         self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
         self._raw_link = raw_link(link, any(bound.message.fd for bound in self.binding.outgoing))
         self.seen: Counter[int] = Counter()
-        self._sync_counter = self._last_controlword = 0
+        self._sync_counter = 0
         self._pending_flags = 0
         self._down = self._late = False
         self._tick: Any = None
@@ -101,6 +107,12 @@ class DriveClient:
         self._state = np.zeros(1, STATE)
         self._cells: Any = self._state.view("i8").data
         self._last = np.full(max(len(self.binding.incoming), 1), -1, np.int64)
+        link, real = self._raw_link, self._now is time.monotonic_ns
+        shared = (self._state, self._words, self._log)
+        self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
+        self._drain_socket: Callable[[int, bool], int] | None = None
+        self._latch: Callable[[int], int] | None = None
+        self._command: Callable[[], int] | None = None
 
     def _make_senders(self) -> None:
         """What lays out and sends each command and SYNC."""
@@ -108,6 +120,7 @@ class DriveClient:
         values = np.array([*[0.0] * len(SOURCES), *constants])
         values[SOURCES.index("load_enable")] = 1.0
         self._values: Any = values.data
+        self._commanding = (values, messages, signals)
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
         for out in self._outgoing:
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
@@ -118,6 +131,8 @@ class DriveClient:
             self._sync.raw[4] = min(self._sync.message.length, 1)
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
+            if self._port is not None:
+                self._latch = self._port.latcher(self._sync.raw, len(self._sync.view))
 
     def _bind(self, tick: Any) -> None:
         """Reach this tick record; the loop hands in the same one each time. Raises TypeError for another."""
@@ -127,10 +142,15 @@ class DriveClient:
         self._cells[_ECHO_AT] = -1 if self.binding.map.echo else tick.dtype.fields["echo"][1]
         args = (self._buffer, messages, signals, self._last, self._state, self._words, raw, self._log)
         self._take: Callable[[int, bool, int], int] = partial(entry(take, *args, 0, False, 0), *args)
-        self._translate = translator(self.binding.map.states, lambda: self._last_controlword)
+        self._translate = translator(self.binding.map.states, lambda: int(self._cells[_CONTROLWORD]))
         self._flags_cell, self._state_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_state")
         self._error_cell = cell_of(tick, "drive_error")
-        self._sent_cells = [cell_of(tick, name) for name in ("counter", "controlword", "u_q", "u_d", "T_L")]
+        self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
+        if self._port is not None:
+            self._drain_socket = self._port.drainer(args)
+            if len(self._outgoing) == 1:
+                places = np.array([tick.dtype.fields[name][1] for name in _SENT_FIELDS])
+                self._command = self._port.commander(self._outgoing[0].raw, self._commanding, raw, places)
         self._tick = tick
 
     @property
@@ -141,9 +161,19 @@ class DriveClient:
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
         self._cells[_GOT] = 0
-        if tick is not self._tick or self._pending_flags or self._down or self._raw_link.pending():
+        if self._latch is None or tick is not self._tick or self._pending_flags or self._down:
             self._take_late(tick)
-        self._send_sync()
+            self._send_sync()
+            return
+        count = self._sync_counter % 240 + 1
+        code = self._latch(count)
+        if code == PENDING:
+            self._take_late(tick)
+            self._send_sync()
+            return
+        self._sync_counter = count
+        if code < 0:
+            self._fail(code)
 
     def _take_late(self, tick: Any) -> None:
         self._late = True
@@ -171,7 +201,7 @@ class DriveClient:
             self._bind(tick)
         flags, self._pending_flags = self._pending_flags, 0
         try:
-            flags |= self._drain(deadline_ns)
+            flags |= self._drain(deadline_ns) if self._drain_socket is None else self._drain_port(deadline_ns)
         except LinkDown:
             self._down = True
         except LinkError:
@@ -196,6 +226,22 @@ class DriveClient:
             if flags & FRESH and deadline_ns:
                 break
         return flags
+
+    def _drain_port(self, deadline_ns: int) -> int:
+        """:meth:`_drain` by the compiled kernel, which hands back what it can't judge."""
+        port, drain = self._port, self._drain_socket
+        assert port is not None and drain is not None  # noqa: S101 - made together
+        io = port.io
+        io[FLAGS], io[MORE] = 0, DRAIN_MOST
+        while code := drain(deadline_ns, self._late):
+            if code < 0:
+                raise_link_error(OSError(-code, os.strerror(-code)), "receive")
+            io[FLAGS] |= io[SEEN] if 0 <= io[SEEN] < STATE_RAW else self._finish(io[SEEN], io[SIZE])
+            if self._cells[_LOGGED] >= ROOM - 1:
+                self.flush()
+            if deadline_ns and io[FLAGS] & FRESH:
+                break
+        return int(io[FLAGS])
 
     def _finish(self, seen: int, size: int) -> int:
         """Flags of a frame that the kernel leaves to be finished: one of no measurement, or a raw state."""
@@ -239,8 +285,23 @@ class DriveClient:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:
             self._bind(tick)
-        counter, controlword, u_q, u_d, T_L = self._sent_cells
-        self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
+        if self._command is not None and not self._down:
+            code = self._command()
+            if code:
+                self._refuse(self._outgoing[0]) if code == REFUSED_COMMAND else self._fail(code)
+        else:
+            counter, controlword, u_q, u_d, T_L = self._sent_cells
+            self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
+        if self._cells[_LOGGED] >= FLUSH_AT:
+            self.flush()
+
+    def _fail(self, code: int) -> NoReturn:
+        """Raise what -errno of sending means, and remember it."""
+        try:
+            raise_link_error(OSError(-code, os.strerror(-code)), "send")
+        except LinkError as error:
+            self._note_failure(error)
+            raise
 
     def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
         """Lay out all frames before the first is sent, then send them, the one with u_q last."""
@@ -253,8 +314,7 @@ class DriveClient:
                 self._refuse(out)
         for out in self._outgoing:
             self._transmit(out)
-        self._cells[_LAST_SENT], self._last_controlword = counter, controlword
-        self.flush()
+        self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
 
     def _refuse(self, out: Outgoing) -> NoReturn:
         """Raise with the codec's words what of a command can't be sent."""
@@ -272,7 +332,7 @@ class DriveClient:
         except LinkError as error:
             self._note_failure(error)
             raise
-        if self._on_frames is not None:
+        if self._cells[_LOGGED] < len(self._log):
             self._cells[_LOGGED] += 1
 
     def _note_failure(self, error: LinkError) -> None:
@@ -283,7 +343,7 @@ class DriveClient:
             self._pending_flags |= SEND_FAILED
 
     def flush(self) -> None:
-        """Hand the frames of this tick on."""
+        """Hand the frames on that came and went since the last time."""
         count = self._cells[_LOGGED]
         if count and self._on_frames is not None:
             self._cells[_LOGGED] = 0

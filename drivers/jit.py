@@ -40,6 +40,11 @@ def jit(function: Function) -> Function:
     return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
 
 
+def waiting(function: Function) -> Function:
+    """:func:`jit` for a kernel that waits: other threads of Python's run meanwhile."""
+    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+
+
 def entry(kernel: Function, *example: Any) -> Function:
     """The compiled form of ``kernel`` for arguments of the types of ``example``, which is called once.
 

@@ -57,9 +57,13 @@ MESSAGE: Final = np.dtype(
 """``modulus`` 0: no counter, else the first signal is one. ``bit``: of a message that measures, 0 for slow
 values; ``seen``: what a good frame is flagged with besides."""
 STATE: Final = np.dtype(
-    [("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("last_sent", "i8"), ("logged", "i8")]
-)
-"""``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has."""
+    [
+        ("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("logged", "i8"),
+        ("last_sent", "i8"), ("controlword", "i8"),
+    ]
+)  # fmt: skip
+"""``last_sent``, ``controlword``: of the last command.
+``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has."""
 FRAME: Final = np.dtype(
     [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
 )
@@ -173,7 +177,9 @@ def put(tick: Any, g: Any, value: float) -> None:
 
 @jit
 def note(log: Any, s: Any, raw: Any, received: int, t_ns: int) -> None:
-    """Write a frame to the next place of the log, which counts once ``logged`` goes on."""
+    """Write a frame to the next place of the log, which counts once ``logged`` goes on; none when full."""
+    if s["logged"] >= len(log):
+        return
     entry = log[s["logged"]]
     entry["t_ns"], entry["received"], entry["size"] = t_ns, received, min(int(raw[4]), 64)
     entry["can_id"] = int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
@@ -184,8 +190,7 @@ def note(log: Any, s: Any, raw: Any, received: int, t_ns: int) -> None:
 @jit
 def note_sent(log: Any, state: Any, raw: Any, t_ns: int) -> int:
     """:func:`note` for a frame that stands in its buffer."""
-    if len(log) > 0:
-        note(log, state[0], raw, 0, t_ns)
+    note(log, state[0], raw, 0, t_ns)
     return 0
 
 
@@ -237,7 +242,7 @@ def take(
     s = state[0]
     if int(raw[4]) > size - DATA_AT:
         return 0
-    if len(log) > 0:
+    if s["logged"] < len(log):
         note(log, s, raw, 1, t_ns)
         s["logged"] += 1
     index = find(raw, messages)
@@ -338,6 +343,5 @@ def encode(
     elif m["profile"] == 5:
         crc = crc_of(raw, m)
         raw[DATA_AT], raw[DATA_AT + 1] = crc & 0xFF, crc >> 8
-    if len(log) > 0:
-        note(log, state[0], raw, 0, t_ns)
+    note(log, state[0], raw, 0, t_ns)
     return FD_BYTES if m["fd"] else CLASSIC_BYTES

@@ -367,6 +367,7 @@ def test_frames_are_shown_both_ways(channel: str) -> None:
     bench.feed("FEEDBACK", Counter=0)
     bench.client.sync(bench.tick)
     bench.client.send(bench.tick)
+    bench.client.flush()
     assert seen == [(True, 42, 0x181, 8), (False, 42, 0x80, 1), (False, 42, 0x201, 8)]
     bench.close()
 
