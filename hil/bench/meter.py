@@ -21,18 +21,14 @@ LOOP: Final = "loop"
 PHASES: Final[dict[str, tuple[str, ...]]] = {
     "sleep": ("hil.clock:RealClock.sleep_until",),
     "sync": ("drivers.client:DriveClient.sync",),
-    "receive": tuple(
-        f"drivers.bus:SocketLink.{name}" for name in ("pending", "receive", "receive_raw", "receive_into")
-    ),
-    "check and decode": ("drivers.client:DriveClient.receive",),
-    "reference": ("hil.design:Machine.prepare",),
-    "control and guard": ("hil.design:Machine.step",),
-    "encode": ("drivers.client:DriveClient.send",),
-    "send": tuple(f"drivers.bus:SocketLink.{name}" for name in ("send", "send_raw")),
+    "receive, check, decode": ("drivers.client:DriveClient.receive",),
+    "control and guard": ("hil.design:Machine.looped()",),
+    "encode, send": ("drivers.client:DriveClient.send",),
     "record": ("hil.log.recorder:Recorder.tick", "hil.log.recorder:Recorder.frames"),
     "guardian": tuple(f"hil.guardian:GuardedDrive.{name}" for name in ("sync", "receive", "send")),
 }
-"""Where each phase is; what is in none of them is ``loop``. A method that is not there is left out."""
+"""Where each phase is; what is in none of them is ``loop``. A method with () makes
+what is called; one that is not there is left out."""
 Function = Callable[..., Any]
 
 
@@ -66,6 +62,10 @@ class Meter:
 
         return metered
 
+    def wrap_made(self, index: int, factory: Function) -> Function:
+        """A factory whose products are metered."""
+        return lambda *args: self.wrap(index, factory(*args))
+
     def start(self) -> None:
         """Begin at zero, outside every phase."""
         for sums in (self.ns, self.calls, self.made):
@@ -98,10 +98,11 @@ def install(meter: Meter) -> None:
     for index, name in enumerate(meter.names):
         for target in PHASES.get(name, ()):
             module, _, path = target.partition(":")
-            owner_name, _, method = path.partition(".")
+            owner_name, _, method = path.removesuffix("()").partition(".")
             owner = getattr(import_module(module), owner_name)
             if hasattr(owner, method):
-                setattr(owner, method, meter.wrap(index, getattr(owner, method)))
+                put = meter.wrap_made if path.endswith("()") else meter.wrap
+                setattr(owner, method, put(index, getattr(owner, method)))
 
 
 def run_metered(report: Path, words: list[str]) -> int:

@@ -16,8 +16,8 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-import drivers.fast
-from drivers.frames import Incoming
+import drivers.client
+import drivers.wire
 from tests.fuzz import client, guard
 from tests.fuzz.files import Take
 from tests.mutation.mutants import put_in_place
@@ -67,43 +67,32 @@ def guard_breaks() -> dict[str, Callable[[], None]]:
 
 def unchecked() -> None:
     """Apply frames with a wrong CRC."""
-    make = Incoming.__init__
-
-    def init(self: Incoming, bound: Any) -> None:
-        make(self, bound)
-        self.valid = lambda data: True
-
-    Incoming.__init__ = init  # type: ignore[method-assign]
-
-
-def unchecked_raw() -> None:
-    """Apply a socket's frames with a wrong CRC."""
-    drivers.fast.crc_lines = lambda *a, **k: ("", {})  # type: ignore[attr-defined]
+    drivers.wire.is_valid = lambda raw, m: True
 
 
 def by_halves() -> None:
     """Apply the first value of a frame before it is judged."""
-    whole = Incoming.take
+    whole = drivers.wire.take
 
-    def take(self: Incoming, data: bytes, late: bool = False) -> int:
-        if len(data) == self.length:
-            self.cells[0][0] = self._read(data)[1]
-        return whole(self, data, late)
+    def take(*args: Any) -> Any:
+        raw, messages, signals, words, tick = (args[place] for place in (0, 1, 2, 5, 6))
+        index = drivers.wire.find(raw, messages)
+        if index >= 0 and int(raw[4]) == messages[index]["length"]:
+            signal = signals[messages[index]["first"] + (messages[index]["modulus"] > 0)]
+            value = drivers.wire.phys_of(raw, messages[index]["length"], signal, words)
+            drivers.wire.put(tick, signal, value)
+        return whole(*args)
 
-    Incoming.take = take  # type: ignore[method-assign]
+    drivers.client.take = take  # type: ignore[attr-defined]
 
 
 def late_applied() -> None:
     """Apply what came too late for its tick."""
-    whole = Incoming.take
-
-    def take(self: Incoming, data: bytes, late: bool = False) -> int:
-        return whole(self, data, False)
-
-    Incoming.take = take  # type: ignore[method-assign]
+    whole = drivers.wire.take
+    drivers.client.take = lambda *args: whole(*args[:9], False, args[10])  # type: ignore[attr-defined]
 
 
-CLIENT = {f.__doc__ or "": f for f in (unchecked, unchecked_raw, by_halves, late_applied)}
+CLIENT = {f.__doc__ or "": f for f in (unchecked, by_halves, late_applied)}
 
 
 def noticed_after(put: Callable[[], None], name: str, take: Take, inputs: int) -> int:

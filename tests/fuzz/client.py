@@ -7,6 +7,7 @@ are taken: frames taken apart, and frames as a socket hands them out.
 
 from __future__ import annotations
 
+import socket
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,9 @@ class PlainLink:
     def __init__(self) -> None:
         self.waiting: list[bytes] = []
 
+    def put(self, frames: list[bytes]) -> None:
+        self.waiting += frames
+
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None: ...
 
     def receive(self, timeout_ns: int) -> Frame | None:
@@ -60,32 +64,43 @@ class PlainLink:
 
 
 class RawLink(SocketLink):
-    """A bus whose raw frames wait in a list."""
+    """A socket's end; the frames that come are put in at the other, and what is sent leads nowhere."""
 
     def __init__(self) -> None:
-        self.waiting: list[bytes] = []
+        self._far, receiving = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._drain, sending = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._drain.setblocking(False)
+        bus: Any = None
+        super().__init__(bus, receiving, sending)
 
-    def carries(self, fd: bool) -> bool:
-        return True
+    def put(self, frames: list[bytes]) -> None:
+        with suppress(BlockingIOError):
+            while self._drain.recv(128):
+                pass
+        for raw in frames:
+            self._far.send(raw)
 
-    def pending(self) -> bool:
-        return bool(self.waiting)
-
-    def send_raw(self, raw: bytes) -> None: ...
-
-    def receive_raw(self, timeout_ns: int) -> bytes | None:
-        return self.waiting.pop(0) if self.waiting else None
+    def close(self) -> None:
+        for one in (self._far, self._drain, self._receiving, self._sending):
+            one.close()
 
 
 def take(data: bytes) -> None:
     """Hand out the input's frames to a client of either kind, some at a time; check after each receive."""
     draw = Draw(data)
     link: Any = (PlainLink, RawLink)[draw.below(2)]()
+    try:
+        exchange(draw, link)
+    finally:
+        link.close()
+
+
+def exchange(draw: Draw, link: Any) -> None:
     client, ticks = DriveClient(link, DATABASE), new_ticks()
     client.warm_up(ticks[0])
     while draw.rest():
         raw = [drawn_frame(draw) for _ in range(draw.below(6))]
-        link.waiting += raw
+        link.put(raw)
         before, tick = held(ticks, MEASURED), ticks[0]
         slow = held(ticks, SLOW)
         tick["rx_flags"] = 0
