@@ -78,7 +78,7 @@ class SocketLink:
     """A link over sockets of SocketCAN's frame layout. ``fd``: the bus was opened for CAN FD."""
 
     def __init__(
-        self, bus: can.BusABC, receiving: socket.socket, sending: socket.socket, fd: bool = True
+        self, bus: can.BusABC | None, receiving: socket.socket, sending: socket.socket, fd: bool = True
     ) -> None:
         self._bus, self._receiving, self._sending, self._fd = bus, receiving, sending, fd
         receiving.setblocking(False)
@@ -152,7 +152,8 @@ class SocketLink:
         """Close the bus."""
         self._fds, self._poll = [-1], _closed  # their number may be another file's by the next call
         self.fds[:] = -1
-        self._bus.shutdown()
+        if self._bus is not None:
+            self._bus.shutdown()
 
 
 def _closed(timeout: float | None = None, /) -> list[tuple[int, int]]:

@@ -20,7 +20,7 @@ from typing import Any
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, Link, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
-from drivers.client import DriveClient, OnFrames
+from drivers.client import DriveClient, OnFrames, precompile
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
@@ -368,7 +368,8 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     check_load(setup)
     request = request or StopRequest()
     config = setup.config
-    setup.machine.warm_up()
+    setup.machine.warm_up()  # compiling takes longer than anything later waits for
+    precompile(setup.database, setup.binding.map, config.controller.kind == "fac", new_ticks()[0])
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()

@@ -70,8 +70,7 @@ class RawLink(SocketLink):
         self._far, receiving = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._drain, sending = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._drain.setblocking(False)
-        bus: Any = None
-        super().__init__(bus, receiving, sending)
+        super().__init__(None, receiving, sending)
 
     def put(self, frames: list[bytes]) -> None:
         with suppress(BlockingIOError):

@@ -72,9 +72,10 @@ class Forked:
 
 def warm_up() -> None:
     """Import everything and load the compiled kernels once, before any process is forked."""
-    from hil.app import Overrides, load_setup, opened_client
+    from drivers.client import precompile
+    from hil.app import Overrides, load_setup
     from hil.bench.pieces import guard_ns
-    from hil.clock import RealClock
+    from hil.signals import new_ticks
     from hil.simulate import simulate_ticks
 
     setup = load_setup(Path(CONFIG), Overrides(settings=("loop.duration_s=0.05",)))
@@ -83,9 +84,8 @@ def warm_up() -> None:
     node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
     node[0].warm_up()
     node[1].close()
-    local = load_setup(Path(CONFIG), Overrides(settings=('bus.interface="hil-local"',)))
-    with opened_client(local, None, RealClock()):  # the kernels of a socket
-        local.machine.looped()
+    precompile(setup.database, setup.binding.map, False, new_ticks()[0])
+    setup.machine.looped()
     read_in()
 
 
