@@ -34,6 +34,7 @@ from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Words, guardian
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
+from hil.log.split import part_path
 from hil.loop import Loop, Outcome, Plan, StopRequest
 from hil.ports import Drive
 from hil.progress import say, watching
@@ -231,7 +232,8 @@ def log_path(setup: Setup, kind: str) -> Path:
     log = setup.config.log
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     name = log.name or f"{setup.path.stem}-{kind}-{stamp}"
-    return (setup.path.parent / log.folder / f"{name}.mcap").resolve()
+    path = (setup.path.parent / log.folder / f"{name}.mcap").resolve()
+    return path if log.split_s is None and log.split_mb is None else part_path(path, 0)
 
 
 def _git_commit() -> str:
@@ -290,6 +292,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
             **{f"version {name}": package_version(name) for name in packages},
         },
         "attachments": attachments,
+        "split": {"s": setup.config.log.split_s, "mb": setup.config.log.split_mb},
     }
 
 

@@ -301,6 +301,8 @@ class LogTable(Table):
     folder: str = "../logs"
     name: str | None = None
     frames: bool = True
+    split_s: Annotated[float, Field(ge=1)] | None = None
+    split_mb: Annotated[float, Field(ge=1)] | None = None
 
 
 class CriteriaTable(Table):

@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +19,8 @@ from hil.control.jit import jit
 from hil.design import Machine, WireFacts, build
 from hil.errors import HilError
 from hil.kernel import step
-from hil.log.reader import Log, LogError, read_blocks
+from hil.log.reader import Log, Source, new_log, read_blocks
+from hil.log.split import STATE
 from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
 
 _KINDS = {field.name: field.kind for field in FIELDS}
@@ -106,6 +106,20 @@ def machine_of(log: Log) -> Machine:
         raise HilError(f"{log.path}: has no usable parameters in it ({error})") from error
 
 
+def restored(machine: Machine, text: str) -> tuple[Machine, int]:
+    """The machine in a kept state, and the last tick before it. Raises HilError."""
+    fresh = machine.fresh()
+    try:
+        kept = json.loads(text)
+        if "law_state" not in kept:
+            raise HilError("ticks were lost before this part, so its state was not known")
+        for own, name in ((fresh.safety_state, "safety_state"), (fresh.law_state, "law_state")):
+            own[:] = np.frombuffer(bytes.fromhex(kept[name]), own.dtype)
+        return fresh, int(kept["k"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise HilError(f"the kept state is not usable ({error})") from error
+
+
 def set_inputs(ticks: TickArray, logged: TickArray) -> None:
     """Copy times and inputs of the logged ticks; every output is left to be computed."""
     for field in FIELDS:
@@ -182,10 +196,14 @@ class _Replay:
     def begin(self, ticks: TickArray) -> bool:
         """Design the controller at the first tick; False when the run's beginning is missing."""
         self.first_ns, self.last_k = int(ticks["t_ns"][0]), int(ticks["k"][0]) - int(ticks["gap"][0])
-        if int(ticks["k"][0]) != 0:
+        kept = self.log.attachments.get(STATE)
+        if kept is not None:
+            self.machine, self.last_k = restored(machine_of(self.log), kept)
+        elif int(ticks["k"][0]) != 0:
             self.why = f"the log begins at tick {int(ticks['k'][0])}; its beginning is missing"
             return False
-        self.machine = machine_of(self.log).fresh()
+        else:
+            self.machine = machine_of(self.log).fresh()
         return True
 
     def take(self, ticks: TickArray) -> bool:
@@ -250,15 +268,15 @@ def tick_blocks(log: Log) -> Iterator[TickArray]:
             yield block.records
 
 
-def replay(path: Path, window: Window | None = None, seen: Callable[[int], None] | None = None) -> Verdict:
+def replay(
+    source: Source, window: Window | None = None, seen: Callable[[int], None] | None = None
+) -> Verdict:
     """Replay a file; what can't be replayed is a verdict, not an exception.
 
     ``seen`` is told after each block how many ticks are done.
     """
     try:
-        if not path.is_file():
-            raise LogError(f"{path}: no such file")
-        log = Log(path, new_ticks(0))
+        log = new_log(source)
         return _run(_Replay(log, window or Window()), tick_blocks(log), seen or (lambda _: None))
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))

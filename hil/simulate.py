@@ -27,8 +27,10 @@ from hil.errors import ConfigError
 from hil.kernel import prepare, step
 from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
+from hil.log.split import SplitFile, open_run
 from hil.loop import transition_event
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
+from hil.snapshot import StateFollower
 
 Record = npt.NDArray[np.void]
 BLOCK: Final = 1024
@@ -180,7 +182,9 @@ def simulate(
     start = time.perf_counter()
     with contextlib.ExitStack() as stack:
         header = header_of(setup, "simulate", "lockstep") if log else {}
-        file = stack.enter_context(RunFile(path, header)) if log else None
+        file: RunFile | SplitFile | None = open_run(path, header, StateFollower) if log else None
+        if file:
+            stack.enter_context(file)
         last, count = _through(simulation, file, seen or (lambda _: None))
         reason = Reason(int(last["reason"]))
         if file:
@@ -198,7 +202,9 @@ def simulate(
     }
 
 
-def _through(simulation: Simulation, file: RunFile | None, seen: Callable[[int], None]) -> tuple[Any, int]:
+def _through(
+    simulation: Simulation, file: RunFile | SplitFile | None, seen: Callable[[int], None]
+) -> tuple[Any, int]:
     """Run to the end, ticks and changes of state into the file; the last tick and how many there were."""
     last, count, state = new_ticks()[0], 0, int(DriveState.SWITCH_ON_DISABLED)
     for ticks in simulation.blocks():

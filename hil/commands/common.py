@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -57,6 +58,18 @@ def overrides(args: argparse.Namespace) -> Overrides:
     if getattr(args, "duration", None) is not None:
         settings.append(f"loop.duration_s={float(args.duration)}")
     return Overrides(args.interface, args.channel, args.bitrate, args.fd, tuple(settings))
+
+
+def one_run(paths: Sequence[Path]) -> tuple[Path, ...]:
+    """The parts of one run in order. Raises HilError for files of several runs."""
+    from hil.errors import HilError
+    from hil.log.parts import grouped
+
+    runs = grouped(paths)
+    if len(runs) > 1:
+        names = ", ".join(run[0].name for run in runs)
+        raise HilError(f"{names} are no parts of one run; this command takes one run at a time")
+    return runs[0]
 
 
 def print_json(value: Any) -> None:

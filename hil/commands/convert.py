@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, print_json
+from hil.commands.common import Commands, one_run, print_json
 
 
 def register(commands: Commands) -> None:
@@ -16,7 +16,7 @@ def register(commands: Commands) -> None:
         "Write LOG in another format, by the ending of FILE: ticks as .parquet .csv .mat .mf4, "
         "frames as .log (candump) .asc .blf, .mf4 with --frames.",
     )
-    command.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a log, or the parts of one run")
     command.add_argument("-o", "--output", type=Path, metavar="FILE", required=True)
     command.add_argument(
         "--frames", action="store_true", help="the frames, where FILE may hold either (.mf4)"
@@ -40,7 +40,7 @@ def cmd_export(args: argparse.Namespace) -> int:
     from hil.convert.export import export
     from hil.view import key_values, show
 
-    found = export(args.log, args.output, frames=args.frames, force=args.force).as_dict()
+    found = export(one_run(args.logs), args.output, frames=args.frames, force=args.force).as_dict()
     if args.json:
         print_json(found)
     else:

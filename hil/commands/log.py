@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, print_json
+from hil.commands.common import Commands, one_run, print_json
 
 
 def register(commands: Commands) -> None:
     """Add what this module offers."""
     command = commands.add("info", cmd_info, "Say what is in LOG, from its summary alone.")
-    command.add_argument("log", type=Path, metavar="LOG", help="an MCAP file of hil")
+    command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a log, or the parts of one run")
     command = commands.add(
         "recover", cmd_recover, "Rewrite a damaged LOG with its summary and say what is missing."
     )
@@ -21,10 +21,11 @@ def register(commands: Commands) -> None:
 
 def cmd_info(args: argparse.Namespace) -> int:
     """Say what is in a log."""
-    from hil.log.info import info
+    from hil.log.info import info, info_of
     from hil.view import key_values, show
 
-    found = info(args.log).as_dict()
+    paths = one_run(args.logs)
+    found = (info(paths[0]) if len(paths) == 1 else info_of(paths)).as_dict()
     if args.json:
         print_json(found)
     else:

@@ -41,6 +41,7 @@ def register(commands: Commands) -> None:
 def cmd_replay(args: argparse.Namespace) -> int:
     """Replay logs."""
     from hil.errors import HilError
+    from hil.log.parts import grouped
     from hil.replay import Window
 
     end = float("inf") if args.end is None else args.end
@@ -52,19 +53,19 @@ def cmd_replay(args: argparse.Namespace) -> int:
         raise HilError("-o needs --config; a replay itself writes nothing")
     if not 0 <= args.start < end:
         raise HilError(f"--from {args.start:g} --to {end:g}: no such window")
-    results = [_timed(path, Window(args.start, end)) for path in args.logs]
+    results = [_timed(paths, Window(args.start, end)) for paths in grouped(args.logs)]
     _report(args, results)
     return max(verdict.exit_code for _, verdict, _ in results)
 
 
-def _timed(path: Path, window: Window) -> tuple[Path, Verdict, float]:
+def _timed(paths: tuple[Path, ...], window: Window) -> tuple[Path, Verdict, float]:
     from hil.replay import replay
     from hil.view import progress
 
     start = time.perf_counter()
-    with progress(f"replay {path.name}", _ticks_of(path)) as seen:
-        verdict = replay(path, window, seen)
-    return path, verdict, time.perf_counter() - start
+    with progress(f"replay {paths[0].name}", _ticks_of(paths[0]) if len(paths) == 1 else None) as seen:
+        verdict = replay(paths, window, seen)
+    return paths[0], verdict, time.perf_counter() - start
 
 
 def _ticks_of(path: Path) -> int | None:

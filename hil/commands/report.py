@@ -21,11 +21,14 @@ def register(commands: Commands) -> None:
 
 def cmd_report(args: argparse.Namespace) -> int:
     """Write a report."""
+    from hil.log.parts import grouped
     from hil.report.build import build
     from hil.report.criteria import SIGNS, judge
     from hil.view import key_values, show
 
-    report = build(args.log, args.output or args.log[0].with_suffix(".html"), verify=not args.no_replay)
+    report = build(
+        grouped(args.log), args.output or args.log[0].with_suffix(".html"), verify=not args.no_replay
+    )
     if args.json:
         print_json(report.as_dict())
     else:

@@ -14,9 +14,8 @@ import numpy as np
 from hil.convert.recordings import Candump, Mf4Recording, Vector
 from hil.convert.tables import CsvTable, Mf4Table, ParquetTable, write_mat
 from hil.log.errors import LogError
-from hil.log.reader import Log, read_blocks
+from hil.log.reader import Log, Source, new_log, read_blocks
 from hil.log.schema import Records
-from hil.signals import new_ticks
 
 SLAB: Final = 1 << 16
 """Records that are gathered before they are written: row groups of Parquet, 25 MB of memory."""
@@ -81,7 +80,7 @@ def replacing(out: Path, *, force: bool) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def export(source: Path, out: Path, *, frames: bool = False, force: bool = False) -> Exported:
+def export(source: Source, out: Path, *, frames: bool = False, force: bool = False) -> Exported:
     """Write the log ``source`` as ``out``; the ending names the format. Raises LogError.
 
     ``frames``: the frames, where the ending can stand for them and for ticks.
@@ -91,14 +90,12 @@ def export(source: Path, out: Path, *, frames: bool = False, force: bool = False
         raise LogError(f"{out}: the ending must be one of {' '.join(sorted([*FORMATS, MAT]))}")
     if frames and kind not in FRAMES_OF and (kind == MAT or FORMATS[kind][0] != "frames"):
         raise LogError(f"{out}: {kind} holds ticks; frames go to .log .asc .blf .mf4")
-    if not source.is_file():
-        raise LogError(f"{source}: no such file")
+    log = new_log(source)
     with replacing(out, force=force) as part:
         if kind == MAT:
             log = write_mat(part, source)
             holds, count = "ticks", len(log.ticks)
         else:
-            log = Log(source, new_ticks(0))
             holds, opened = ("frames", FRAMES_OF[kind]) if frames and kind in FRAMES_OF else FORMATS[kind]
             count = _stream(log, part, holds, opened)
     return Exported(str(out), holds, count, out.stat().st_size, log.damage)

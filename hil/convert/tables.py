@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hil.convert.frame import need, title
-from hil.log.reader import Log, open_log
+from hil.log.reader import Log, Source, open_log
 from hil.signals import FIELDS, TickArray
 
 
@@ -92,7 +92,7 @@ class Mf4Table:
             self._file.close()
 
 
-def write_mat(path: Path, source: Path) -> Log:
+def write_mat(path: Path, source: Source) -> Log:
     """MATLAB 5 file: a vector a field, structs ``units``, ``meanings`` and ``run``.
 
     Holds all ticks in memory; raises LogError when they do not fit into half of it.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
@@ -55,6 +56,25 @@ class Info:
             "attachments": self.attachments,
             "damage": self.damage,
         }
+
+
+def info_of(paths: Sequence[Path]) -> Info:
+    """Several parts of one run as one: counts and bytes in all. Raises LogError as :func:`info`."""
+    infos = [info(path) for path in paths]
+    first, last = infos[0], infos[-1]
+    topics = dict.fromkeys(topic for one in infos for topic in one.counts)
+    damages = [f"{one.path.name}: {one.damage}" for one in infos if one.damage]
+    result = {name: text for name, text in last.metadata.items() if name == "result"}
+    return Info(
+        path=first.path,
+        size=sum(one.size for one in infos),
+        counts={topic: sum(one.counts.get(topic, 0) for one in infos) for topic in topics},
+        start_ns=first.start_ns,
+        end_ns=last.end_ns,
+        metadata={name: text for name, text in first.metadata.items() if name != "result"} | result,
+        attachments=first.attachments,
+        damage="; ".join(damages) or None,
+    )
 
 
 def info(path: Path) -> Info:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -34,9 +34,11 @@ from hil.log.schema import (
 )
 from hil.signals import FIELDS, TICK, TickArray, new_ticks
 
-__all__ = ["Frame", "Log", "LogError", "open_log", "read_blocks"]
+__all__ = ["Frame", "Log", "LogError", "Source", "new_log", "open_log", "read_blocks"]
 
 Rows = npt.NDArray[np.int64]
+Source = Path | Sequence[Path]
+"""A log: one file, or the parts of a split run in order."""
 MEMORY_SHARE: Final = 0.5
 SLAB_TICKS: Final = 1 << 17  # 48 MB, above the size up to which malloc keeps freed memory
 _WHOLE: Final = np.dtype(f"V{TICK.itemsize}")  # copied at once, where TICK is copied field by field
@@ -73,6 +75,8 @@ class Log:
     bytes_lost: int = 0
     tick_count: int = 0
     last_t_ns: int | None = None
+    parts: tuple[Path, ...] = ()
+    """The files of a run that was split, in order; none for a run in one file."""
 
     @property
     def result(self) -> dict[str, Any]:
@@ -271,10 +275,43 @@ def _gather(data: bytes, starts: Rows, dtype: np.dtype[np.void]) -> Records:
 
 
 def read_blocks(log: Log) -> Iterator[Block]:
-    """Go through ``log.path`` chunk by chunk; metadata, events and damage gather in ``log`` on the way.
+    """Go through a log chunk by chunk; metadata, events and damage gather in ``log`` on the way.
 
     Raises LogError for what is no log of hil at all, or one of another version.
     """
+    return _read_parts(log) if len(log.parts) > 1 else _read_file(log)
+
+
+def _read_parts(log: Log) -> Iterator[Block]:
+    """The files of a split run as one: header and kept state are the first part's, the result the last's."""
+    damages = []
+    for number, path in enumerate(log.parts):
+        part = Log(path, new_ticks(0), events=log.events)
+        if number == 0:
+            part.metadata, part.attachments = log.metadata, log.attachments
+        for block in _read_file(part):
+            log.last_t_ns = part.last_t_ns if part.last_t_ns is not None else log.last_t_ns
+            log.tick_count += len(block.records) if block.kind == "ticks" else 0
+            yield block
+        log.bytes_lost += part.bytes_lost
+        log.metadata.pop("result", None) if "result" not in part.metadata else log.metadata.update(
+            result=part.metadata["result"]
+        )
+        damages += [f"{path.name}: {part.damage}"] if part.damage else []
+    log.damage = "; ".join(damages) or None
+
+
+def new_log(source: Source) -> Log:
+    """A log to be read from one file, or from the parts of a split run. Raises LogError for none there."""
+    paths = (source,) if isinstance(source, Path) else tuple(source)
+    for path in paths:
+        if not path.is_file():
+            raise LogError(f"{path}: no such file")
+    return Log(paths[0], new_ticks(0), parts=paths if len(paths) > 1 else ())
+
+
+def _read_file(log: Log) -> Iterator[Block]:
+    """One file."""
     one = _Pass(log)
     try:
         for raw in raw_records(log.path):
@@ -354,13 +391,10 @@ class _Kept:
         return out.view(TICK)
 
 
-def open_log(path: Path | str, *, frames: bool = True) -> Log:
+def open_log(source: Source | str, *, frames: bool = True) -> Log:
     """Read a log up to and around its damage. Raises LogError for what is no log of hil at all."""
-    path = Path(path)
-    log = Log(path, new_ticks(0))
-    if not path.is_file():
-        raise LogError(f"{path}: no such file")
-    kept = _Kept(path)
+    log = new_log(Path(source) if isinstance(source, str) else source)
+    kept = _Kept(log.path)
     for block in read_blocks(log):
         if block.kind == "ticks" or frames:
             kept.add(block)

@@ -17,6 +17,7 @@ from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
 from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
+from hil.log.split import part_path
 from hil.signals import TICK, TickArray, new_ticks
 
 __all__ = ["BYTES_PER_TICK", "LogError", "Recorder", "check_folder", "open_recorder"]
@@ -28,15 +29,16 @@ LOOK_EVERY: Final = 16
 """Ticks between two looks at the writer's heartbeat; its word is looked at in each."""
 LOOK_NS: Final = 100_000_000
 WRITER_SILENT_NS: Final = 2_000_000_000
-START_TIMEOUT_S: Final = 20.0
+START_TIMEOUT_S: Final = 60.0  # a log in parts loads the compiled law
 CLOSE_TIMEOUT_S: Final = 60.0
 
 
 def check_folder(path: Path, needed_bytes: int) -> None:
     """Refuse before arming: folder missing or not writable, file there already, disk too full."""
     folder = path.parent
-    if path.exists():
-        raise LogError(f"{path}: exists already; choose another [log] name")
+    for taken in (path, part_path(path, 0), part_path(path, 1)):
+        if taken.exists():
+            raise LogError(f"{taken}: exists already; choose another [log] name")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe = folder / f".{path.name}.{os.getpid()}.probe"

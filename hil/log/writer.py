@@ -22,6 +22,7 @@ from hil.log.mcapfile import RunFile
 from hil.log.records import EVENT, EVENT_BYTES
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
 from hil.log.schema import FRAME
+from hil.log.split import Follower, SplitFile, open_run
 from hil.signals import TICK
 
 DRAIN_S: Final = 0.02
@@ -50,7 +51,7 @@ class Every:
 class Drain:
     """Rings in, file out."""
 
-    def __init__(self, rings: Rings, file: RunFile) -> None:
+    def __init__(self, rings: Rings, file: RunFile | SplitFile) -> None:
         self._ticks, self._frames, self._events = rings
         self._file = file
         self._t_ns = 0
@@ -59,11 +60,12 @@ class Drain:
     def once(self, *, final: bool = False) -> None:
         """Move everything that is published into the file's chunks."""
         ticks = np.frombuffer(self._ticks.take(final=final), TICK)
+        # taken after the ticks, so none of theirs is missing, and written before, so they share their part
+        self._file.add_frames(np.frombuffer(self._frames.take(final=final), FRAME))
         if len(ticks):
             self._file.add_ticks(ticks)
             self._t_ns = int(ticks["t_ns"][-1])
             self._lateness.append(ticks["lateness_ns"])
-        self._file.add_frames(np.frombuffer(self._frames.take(final=final), FRAME))
         raw = self._events.take(final=final)
         for at in range(0, len(raw), EVENT_BYTES):
             self._event(raw[at : at + EVENT_BYTES])
@@ -120,7 +122,7 @@ def read_opening() -> tuple[dict[str, Any], bytes] | None:
     return opening, rest
 
 
-def serve(rings: Rings, file: RunFile, control: bytes) -> dict[str, Any]:
+def serve(rings: Rings, file: RunFile | SplitFile, control: bytes) -> dict[str, Any]:
     """Drain until standard input ends; return the result that the controller sent, if any."""
     drain, header = Drain(rings, file), rings[0].header
     chunk, stats = Every(CHUNK_S), Every(STATS_S)
@@ -156,11 +158,18 @@ def main() -> int:
     return write_run(rings, *came)
 
 
+def _follower(header: dict[str, Any]) -> Follower:
+    """What knows the controller's state; the compiled law is loaded for a log in parts alone."""
+    from hil.snapshot import StateFollower
+
+    return StateFollower(header)
+
+
 def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
     """Write the file that ``opening`` names; 0 when it is complete."""
     header, file = rings[0].header, None
     try:
-        file = RunFile(Path(opening["path"]), opening["header"], opening["chunk_bytes"])
+        file = open_run(Path(opening["path"]), opening["header"], _follower, opening["chunk_bytes"])
         header[BEAT_AT] += 1
         os.write(1, b"ready\n")
         file.finish(serve(rings, file, control))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hil.errors import HilError
+from hil.log.reader import Source
 from hil.report.collect import Run, collect
 from hil.report.criteria import figures, judge, open_loop
 from hil.report.page import page
@@ -47,7 +48,7 @@ class Report:
         }
 
 
-def build(logs: Sequence[Path], out: Path, *, verify: bool = True) -> Report:
+def build(logs: Sequence[Source], out: Path, *, verify: bool = True) -> Report:
     """Read the logs and write the report. Raises HilError before reading what could not be written."""
     if out.suffix.lower() not in KINDS:
         raise HilError(f"{out}: a report is an HTML page or a PNG picture; name it .html or .png")
@@ -55,7 +56,7 @@ def build(logs: Sequence[Path], out: Path, *, verify: bool = True) -> Report:
         raise HilError(f"{len(logs)} logs: a report compares at most {MOST_LOGS}; name fewer")
     if not out.parent.is_dir():
         raise HilError(f"{out.parent}: no such folder; make it, or choose another file with -o")
-    runs = [collect(path, verify=verify) for path in logs]
+    runs = [collect(source, verify=verify) for source in logs]
     names = [run.name for run in runs]
     for index, run in enumerate(runs):
         run.name = f"{run.name} ({index + 1})" if names.count(names[index]) > 1 else run.name

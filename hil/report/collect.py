@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -13,14 +12,14 @@ from hil.app import frame_time
 from hil.config import RunConfig, validate
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
-from hil.log.reader import Log, LogError, read_blocks
+from hil.log.reader import Log, Source, new_log, read_blocks
 from hil.replay import Verdict, machine_of, replay
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
 from hil.report.frames import Frames, FrameTime, names_of
 from hil.report.segments import Responses
 from hil.report.statistics import Phases, Spectrum, Totals
-from hil.signals import DriveState, TickArray, new_ticks
+from hil.signals import DriveState, TickArray
 
 STOP_WEIGHT: Final = 1e6  # a close-up of an end outweighs that of any load step
 
@@ -138,12 +137,10 @@ class Run:
         ]
 
 
-def collect(path: Path, *, verify: bool = True) -> Run:
+def collect(source: Source, *, verify: bool = True) -> Run:
     """Read a log, and replay it when ``verify``. Raises LogError for what is no log of hil."""
-    if not path.is_file():
-        raise LogError(f"{path}: no such file")
-    log = Log(path, new_ticks(0))
-    run = Run(log, path.stem)
+    log = new_log(source)
+    run = Run(log, log.path.stem)
     for block in read_blocks(log):
         if not len(block.records):
             continue
@@ -156,5 +153,5 @@ def collect(path: Path, *, verify: bool = True) -> Run:
     if run.config is None and not run.config_problem:  # there was no tick
         run.read_config()
     if verify:
-        run.verdict = replay(path)
+        run.verdict = replay(source)
     return run

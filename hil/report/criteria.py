@@ -132,7 +132,7 @@ def _limit(run: Run, figure: Figure, most: float) -> Check:
 
 def _always(run: Run) -> list[Check]:
     """Ended as asked, log whole, nothing dropped, replay the same."""
-    asked = run.ended in ("stop_requested", "quick_stop_requested")
+    asked = run.ended in ("stop_requested", "quick_stop_requested") or run.ended.startswith("goes on in ")
     ended: Outcome = "no data" if open_loop(run) else _outcome(asked)
     missing = run.totals.missing
     whole = run.log.damage is None and bool(run.log.result) and missing == 0
