@@ -6,6 +6,7 @@ Each part but the first holds the controller's state at its first tick, so that 
 
 from __future__ import annotations
 
+import errno
 import uuid
 from collections.abc import Callable
 from pathlib import Path
@@ -71,10 +72,18 @@ class SplitFile:
         self._file = self._open({})
 
     def _open(self, state: dict[str, str]) -> RunFile:
-        """The file of the next part, with what tells which part of which run it is."""
+        """The file of the next part, with what tells which part of which run it is.
+
+        It gets its name once that stands in it: a part is never seen without.
+        """
         header = self._header | {"attachments": self._header.get("attachments", {}) | state}
-        file = RunFile(part_path(self._path, self._number), header, self._chunk_bytes)
+        path = part_path(self._path, self._number)
+        begun = path.with_name(f".{path.name}.begun")
+        file = RunFile(begun, header, self._chunk_bytes)
         file.add_metadata(PART, {"run": self._run, "number": str(self._number)})
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, "a part of that name exists already")
+        begun.rename(path)
         return file
 
     @property
@@ -112,6 +121,7 @@ class SplitFile:
     def _next(self) -> None:
         """The next part; it is there before the last one is finished, so that no moment has neither."""
         before = self._file
+        before.flush()
         self._number += 1
         self._file = self._open({STATE: self._follower.state()})
         self._begun = False

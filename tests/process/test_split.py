@@ -93,6 +93,7 @@ def test_commands_take_parts_as_one_run(parts: list[Path], whole: Any, tmp_path:
     assert shown["ticks"] == len(whole) and shown["replay"]["verdict"] == "same" and shown["damage"] is None
     assert main(["export", *names, "-o", str(tmp_path / "a.csv")]) == 0
     assert len((tmp_path / "a.csv").read_text().splitlines()) == len(whole) + 1
+    capsys.readouterr()
     assert main(["report", str(parts[1]), "-o", str(tmp_path / "p.html"), "--json"]) == 0
     (shown,) = json.loads(capsys.readouterr().out)["runs"]
     checks = {check["name"]: check["outcome"] for check in shown["checks"]}
@@ -106,7 +107,7 @@ def test_a_part_that_is_missing_is_a_gap(parts: list[Path]) -> None:
 
 
 def test_a_damaged_part_is_recovered_as_that_part(parts: list[Path], whole: Any, tmp_path: Path) -> None:
-    (tmp_path / "cut.mcap").write_bytes(parts[1].read_bytes()[: parts[1].stat().st_size * 2 // 3])
+    (tmp_path / "cut.mcap").write_bytes(parts[1].read_bytes()[: parts[1].stat().st_size * 9 // 10])
     out = tmp_path / "out.mcap"
     found = recover(tmp_path / "cut.mcap", out)
     assert 100 < found.ticks < 1000 and replay(out).verdict == "same"
@@ -192,7 +193,9 @@ def test_a_run_on_the_bus_in_parts(configs: Path, settings: Settings, tmp_path: 
         logs.append(open_log(sorted((tmp_path / "logs").glob(f"x{len(logs)}*.mcap"))))
     split, one = logs
     assert len(split.parts) == 3 and same_ticks(split.ticks, one.ticks)
-    assert split.frames == one.frames and split.events == one.events
+    # heartbeats come by the clock on the wall, and so any number of them
+    assert [f for f in split.frames if f.can_id != 0x701] == [f for f in one.frames if f.can_id != 0x701]
+    assert split.events == one.events
     assert all(replay(path).verdict == "same" for path in split.parts)
 
 
@@ -228,7 +231,7 @@ def test_killed_right_at_a_split(configs: Path, settings: Settings, tmp_path: Pa
             time.sleep(0.05)
     found = sorted((tmp_path / "logs").glob("k.*.mcap"))
     log = open_log(found)
-    assert len(found) >= 2 and len(log.ticks) >= 900
+    assert len(found) >= 2 and log.ticks["k"][-1] >= 950
     assert log.gaps == [] and replay(found).verdict == "same"
     assert all(replay(one).verdict == "same" for one in found if len(open_log(one).ticks))
     if who == "controller":
