@@ -240,7 +240,7 @@ def take(
     counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, or UNKNOWN.
     """
     s = state[0]
-    if int(raw[4]) > size - DATA_AT:
+    if size not in (CLASSIC_BYTES, FD_BYTES) or int(raw[4]) > size - DATA_AT:
         return 0
     if s["logged"] < len(log):
         note(log, s, raw, 1, t_ns)

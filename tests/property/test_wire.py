@@ -138,6 +138,8 @@ def test_a_frame_of_another_length_or_size_is_not_taken() -> None:
         data = good[8:].ljust(64, b"\0")[:length]
         assert taker.take(pack_frame(feedback.send_id, data, fd=length > 8)) == LENGTH_ERROR
     assert taker.take(good[:4] + bytes([64]) + good[5:]) == 0, "a classic frame of 64 bytes is no frame"
+    for size in (12, 17, 38, 71):
+        assert taker.take(FD.pack(feedback.send_id, 8, 4, good[8:])[:size]) == 0, "no frame has that size"
     assert taker.take(pack_frame(0x123, b"")) == UNKNOWN
     assert taker.ticks.tobytes() == before
     assert taker.take(FD.pack(feedback.send_id, 8, 4, good[8:])) & FRESH, "the same data in an FD frame"
