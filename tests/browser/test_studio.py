@@ -19,7 +19,7 @@ from tests.node import MISSING, has_packages, modules
 
 TITLES = ("Speed [rad/s]", "Current [A]", "Voltage sent [V]", "Load torque [N m]", "Lateness [ns]")
 PATIENT_S = 240.0  # it is a big program
-SAYS = "document.body.innerText.includes"
+SAYS = "(document.body?.innerText ?? '').includes"
 
 
 @pytest.fixture(scope="module")
