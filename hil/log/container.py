@@ -70,7 +70,7 @@ class Block:
     def add(self, channels: Integers, times: Integers, lengths: Integers, raw: bytes) -> None:
         """Append message records: their channels, log times, lengths in all and bytes."""
         offsets = self.size + np.cumsum(lengths) - lengths
-        self._rows.append((channels, times, offsets))
+        self._rows.append((channels, times.copy(), offsets))  # the caller may fill his array again
         self._parts.append(raw)
         self.size += len(raw)
         self.count += len(times)

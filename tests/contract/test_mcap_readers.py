@@ -6,9 +6,11 @@ from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import MessageIndex
 from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
+from hil.log.mcapfile import RunFile
 from hil.signals import FIELDS
 from tests.logfiles import HEADER, some_frames, some_ticks, write_log
 
@@ -83,3 +85,24 @@ def test_attachments_come_back(path: Path) -> None:
     with path.open("rb") as stream:
         found = {record.name: record.data.decode() for record in make_reader(stream).iter_attachments()}
     assert found == HEADER["attachments"]
+
+
+def test_the_index_holds_the_logged_times_when_the_caller_fills_his_array_again(tmp_path: Path) -> None:
+    ticks, half = some_ticks(200), some_ticks(100)
+    with RunFile(tmp_path / "a.mcap", HEADER, chunk_bytes=150 * 1024) as file:
+        for at in (0, 100):
+            half[:] = ticks[at : at + 100]  # as hil simulate does, block after block
+            file.add_ticks(half)
+        file.finish({"ended": "stop_requested"})
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        spans = [(c.message_start_time, c.message_end_time) for c in summary.chunk_indexes]
+        assert min(spans)[0] == ticks["t_ns"][0] and max(spans)[1] == ticks["t_ns"][-1]
+        for chunk in summary.chunk_indexes:
+            (at,) = chunk.message_index_offsets.values()
+            stream.seek(at)
+            index = next(StreamReader(stream, skip_magic=True, emit_chunks=True).records)
+            assert isinstance(index, MessageIndex)
+            times = [t for t, _ in sorted(index.records, key=lambda entry: entry[1])]
+            assert times == sorted(set(times)) and len(times) == len(index.records)
