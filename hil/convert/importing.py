@@ -8,7 +8,7 @@ shadow run: somebody else closed the loop, and what this controller would have d
 What is not on the wire: the deadlines (SYNC's stamps stand in, on a grid of the period), the phases within a
 tick but for SYNC, feedback and command, what the operator asked (found by trying what he can ask), what the
 log's own writer or the guardian told the loop, and every output but the command (computed anew). Nor is a
-period that was skipped while the drive was being enabled, where no command depends on it and SYNC was held up.
+period that was skipped while the drive was being enabled, where no command depends on it and SYNC was late.
 """
 
 from __future__ import annotations
