@@ -7,6 +7,7 @@ What the values mean physically is left to the modules that use them.
 from __future__ import annotations
 
 import difflib
+import re
 import tomllib
 import types
 import typing
@@ -29,6 +30,8 @@ from hil.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
 MAX_CONFIG_BYTES = 1 << 20
+# tomllib keeps every prefix of a dotted key: one of 100,000 parts would take 40 GB
+_DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){16}""")
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -46,10 +49,16 @@ def read_toml(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise ConfigError(str(path), [f"larger than {MAX_CONFIG_BYTES} bytes; this is no configuration"])
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(str(path), [f"can't be read: {error.strerror or error}"]) from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigError(str(path), [f"is not TOML: {error}"]) from error
+    if _DEEP_KEY.search(text):
+        raise ConfigError(str(path), ["holds a key of more than 16 parts; this is no configuration"])
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # not TOML, or a number of too many digits
         raise ConfigError(str(path), [f"is not TOML: {error}"]) from error
 
 

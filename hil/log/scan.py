@@ -40,7 +40,8 @@ _PARSERS: Final[dict[int, Any]] = {
     Opcode.STATISTICS: Statistics,
     Opcode.FOOTER: Footer,
 }
-_MALFORMED: Final = (McapError, EOFError, ValueError, struct.error, zstandard.ZstdError)
+# a length of 2^63 or more is an OverflowError of the stream that it is read from
+_MALFORMED: Final = (McapError, EOFError, ValueError, OverflowError, struct.error, zstandard.ZstdError)
 
 
 class Raw(NamedTuple):

@@ -219,6 +219,17 @@ def test_a_damaged_attachment_is_named_and_left_out(tmp_path: Path, whole: bytes
     assert len(log.ticks) == 500
 
 
+@pytest.mark.parametrize("claimed", [1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1])
+def test_an_attachment_of_a_claimed_length_is_not_allocated(
+    tmp_path: Path, whole: bytes, claimed: int
+) -> None:
+    """Found by coverage-guided fuzzing: a length that is no index ended in an OverflowError."""
+    size = whole.index(b"text/plain") + len(b"text/plain")
+    log = open_log(saved(tmp_path, whole[:size] + claimed.to_bytes(8, "little") + whole[size + 8 :]))
+    assert "config.toml" not in log.attachments and "attachment" in (log.damage or "")
+    assert len(log.ticks) == 500
+
+
 def test_ticks_are_joined_across_slabs(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.log.reader.SLAB_TICKS", 64)
     assert open_log(saved(tmp_path, whole)).ticks.tobytes() == TICKS.tobytes()
