@@ -45,7 +45,7 @@ def test_two_runs_of_a_boot_cost_the_same(counted: dict[str, Any]) -> None:
 def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str) -> None:
     """A phase that is nowhere has been renamed in the code: the meter's table has to follow.
 
-    The meter takes some thousand instructions a tick, which its own cost takes off but for caches and rounding.
+    The meter takes some thousand instructions a tick, taken off but for caches and rounding.
     """
     bus = of_bus(counted, name)
     assert set(bus["phases"]) == {LOOP, *PHASES}
