@@ -10,6 +10,8 @@ import json
 import os
 import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
 import time
@@ -161,6 +163,7 @@ def stale_counters_beyond_the_budget() -> None:
 
 # SocketCAN's error frames: class, then what the controller tells (passive), then its counters tx and rx
 PASSIVE = "20000004#0030000000008888"
+PASSIVE_RAW = struct.pack("=IB3x8s", 0x20000004, 8, bytes.fromhex("0030000000008888"))
 BUS_OFF = "20000040#0000000000000000"
 
 
@@ -175,8 +178,11 @@ def error_frames_beyond_the_budget() -> None:
     with Scenario("error_frames_beyond_the_budget", seconds=30.0) as s:
         s.start()
         s.running()
-        for _ in range(60):
-            sh("cansend", "vcan0", PASSIVE)
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as own:
+            own.bind(("vcan0",))
+            for _ in range(100):  # one a tick; a cansend for each comes too seldom
+                own.send(PASSIVE_RAW)
+                time.sleep(0.001)
 
 
 def bus_off_is_reported() -> None:
@@ -203,7 +209,9 @@ def queue_is_full() -> None:
         (s.folder / "queued.txt").write_text(sh("tc", "-s", "qdisc", "show", "dev", "can0"))
         (s.folder / "marks.json").write_text(json.dumps({"drained": time.time()}))
         sh("tc", "qdisc", "change", "dev", "can0", *QDISC, "100mbit")
-        sh("cansend", "can0", "7E0#00")  # the queue is looked at again with the next frame
+        # the queue is looked at again with the next frame, even with one that it refuses
+        while subprocess.run(["cansend", "can0", "7E0#00"], capture_output=True, check=False).returncode:
+            time.sleep(0.05)
         time.sleep(0.2)
         sh("cansend", "can0", "080#01")  # what does the drive say of itself now
         time.sleep(0.05)
