@@ -226,7 +226,12 @@ def test_a_shadow_beside_a_controller_sends_nothing_and_computes_the_same(
     assert_shadowed(only_log(shadow_folder), only_log(tmp_path))
 
 
-def assert_shadowed(path: Path, master_path: Path) -> None:
+FEEDBACK = ("echo", "w", "i_q", "i_d")
+
+
+def assert_shadowed(
+    path: Path, master_path: Path, least: int = 2000, names: tuple[str, ...] = FEEDBACK
+) -> None:
     """Nothing sent; and, fed with the same frames, the shadow estimates what the controller estimated."""
     log = open_log(path)
     assert replay(path).verdict == "same"
@@ -234,21 +239,20 @@ def assert_shadowed(path: Path, master_path: Path) -> None:
     assert all(frame.received for frame in log.frames)
     assert any(event["kind"] == "shadow" for event in log.events)
     driven = log.ticks[log.ticks["state"] == DriveState.OPERATION_ENABLED]
-    assert len(driven) > 2000
+    assert len(driven) > least
     master = open_log(master_path).ticks
-    of_master = dict(zip(keys(master), master, strict=True))
-    found = [
-        (tick, of_master[key]) for key, tick in zip(keys(driven), driven, strict=True) if key in of_master
-    ]
+    of_master = dict(zip(keys(master, names), master, strict=True))
+    both = zip(keys(driven, names), driven, strict=True)
+    found = [(tick, of_master[key]) for key, tick in both if key in of_master]
     assert len(found) > 0.8 * len(driven)
     for name, scale in (("d_hat_w", 1e3), ("d_hat_q", 1e4), ("d_hat_d", 1e4)):
         off = np.array([abs(float(mine[name] - its[name])) for mine, its in found[100:]])
         assert np.median(off) < 1e-6 * scale, name
 
 
-def keys(ticks: np.ndarray) -> list[tuple[float, ...]]:
+def keys(ticks: np.ndarray, names: tuple[str, ...]) -> list[tuple[float, ...]]:
     """What tells the feedback of one tick from all others, with that of the tick before."""
-    rows = np.stack([ticks[name] for name in ("echo", "w", "i_q", "i_d")], axis=1)
+    rows = np.stack([ticks[name] for name in names], axis=1)
     before = np.roll(rows, 1, axis=0)
     return [tuple(row) for row in np.concatenate([rows, before], axis=1)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from hil.errors import ArmingError, ConfigError
 from hil.log.reader import open_log
 from hil.signals import Reason
 from tests.conftest import CONFIGS
-from tests.process.test_run import call, flags, hil, wait_for_log
+from tests.process.test_arming import Monitor, assert_shadowed, senders
+from tests.process.test_run import call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
@@ -66,6 +68,33 @@ def test_a_drive_that_dies_stops_the_run(patient: Path, settings: Settings) -> N
     assert process.returncode == 1, errors
     ended = json.loads(out)["ended"]
     assert Reason[ended.upper()] not in (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED), ended
+
+
+def test_a_shadow_beside_a_controller_sends_nothing_and_computes_the_same(
+    patient: Path, settings: Settings, tmp_path: Path, channel: str
+) -> None:
+    """Without an echo the shadow takes the newest command that it saw for what is applied."""
+    own = settings("loop.duration_s=300.0", "reference.down_at_s=290.0", "drive.heartbeat_timeout_s=10.0")
+    folder = tmp_path / "shadow"
+    its = (*own, f'log.folder="{folder / "logs"}"', "loop.duration_s=2.0")
+    monitor = Monitor(channel)
+    with (
+        emulator_process(patient, Overrides(settings=own)),
+        hil("run", str(patient), *flags(own)) as master,
+    ):
+        wait_for_log(tmp_path)
+        before = senders(monitor.count(0.5))
+        with hil("run", str(patient), "--shadow", *flags(its)) as shadow:
+            during: Counter[tuple[int, int]] = Counter()
+            while shadow.poll() is None:
+                during += monitor.count(0.2)
+            assert shadow.returncode == 0, shadow.communicate()
+        during += monitor.count(0.2)
+        master.send_signal(signal.SIGTERM)
+        assert master.wait(30) == 0
+    monitor.close()
+    assert len(before) == 2 and senders(during) == before, "a third one sent something"
+    assert_shadowed(only_log(folder), only_log(tmp_path), least=1000, names=("w", "i_q", "i_d"))
 
 
 def test_check_sees_it_by_its_own_names(patient: Path, settings: Settings) -> None:

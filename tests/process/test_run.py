@@ -60,7 +60,7 @@ def only_log(folder: Path) -> Path:
 
 def wait_for_log(folder: Path) -> Path:
     """The log of a run that has begun, once it has some size."""
-    for _ in range(400):
+    for _ in range(1500):
         logs = sorted(folder.glob("logs/*.mcap"))
         if logs and logs[0].stat().st_size > 50_000:
             return logs[0]
