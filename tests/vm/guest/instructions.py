@@ -22,6 +22,8 @@ from hil.config import RunConfig, load_toml
 from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked
 
 SECONDS = 0.5
+ATTEMPTS = 3
+"""A stall of the whole machine can end a run; a count is of a run that went to its end."""
 REPEATED = "vcan"
 BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
     # name: controller's interface, drive's interface, settings, settings of the plant
@@ -68,12 +70,13 @@ class Bus:
         return ["run", CONFIG, *self.words(self.own), "--json", *arm, *flags("--set", *more)]
 
     def result(self, job: Callable[[], int], name: str) -> str:
-        """What a process of its own printed."""
+        """What a process of its own printed, once it went to its end."""
         out = self.folder / name
-        code = Forked(out, job).wait()
-        if code:
-            raise RuntimeError(f"{self.name}: {name} ended with {code}: {out.read_text()[-300:]}")
-        return out.read_text()
+        for _ in range(ATTEMPTS):
+            if (code := Forked(out, job).wait()) == 0:
+                return out.read_text()
+            sys.stderr.write(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}\n")
+        raise RuntimeError(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}")
 
     def plain(self, name: str) -> float:
         said = json.loads(self.result(lambda: cli.main(self.run_words()), name))
