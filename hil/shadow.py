@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from hil.loop import NO_WAIT
 from hil.ports import Drive
 from hil.signals import RxFlag
 
@@ -27,8 +28,10 @@ class ShadowDrive:
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Wait for feedback; note what the other controller has applied from now on."""
         self._drive.receive(tick, deadline_ns)
-        tick["rx_flags"] = int(tick["rx_flags"]) & ~int(RxFlag.FOREIGN_COMMAND)
-        tick["u_q_seen"], tick["u_d_seen"] = self._applied(int(tick["echo"]))
+        flags = tick["rx_flags"] = int(tick["rx_flags"]) & ~int(RxFlag.FOREIGN_COMMAND)
+        # a look for more feedback that finds none may find the command that answers this one: not applied yet
+        if flags & RxFlag.FRESH or deadline_ns != NO_WAIT:
+            tick["u_q_seen"], tick["u_d_seen"] = self._applied(int(tick["echo"]))
 
     def send(self, tick: Any) -> None:
         """Send nothing, and say so in the tick."""
