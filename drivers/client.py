@@ -72,7 +72,7 @@ def precompile(database: Database, drive_map: DriveMap | None, load: bool, tick:
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ends[0], ends[1]:
         link = SocketLink(None, *ends)
-        DriveClient(link, database, load=load, drive_map=drive_map).warm_up(tick)
+        DriveClient(link, database, load=load, drive_map=drive_map).prepare(tick)
 
 
 class DriveClient:
@@ -143,8 +143,8 @@ class DriveClient:
             if self._port is not None:
                 self._latch = self._port.latcher(self._sync.raw, len(self._sync.view))
 
-    def _bind(self, tick: Any) -> None:
-        """Reach this tick record; the loop hands in the same one each time. Raises TypeError for another."""
+    def prepare(self, tick: Any) -> None:
+        """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
         raw = bytes_of(tick)
         messages, signals, needed = incoming_tables(self.binding, tick.dtype)
         self._cells[_NEEDED] = needed
@@ -207,7 +207,7 @@ class DriveClient:
         What is queued when the deadline has passed is still taken, up to a bound that a flood can't exceed.
         """
         if tick is not self._tick:
-            self._bind(tick)
+            self.prepare(tick)
         flags, self._pending_flags = self._pending_flags, 0
         try:
             flags |= self._drain(deadline_ns) if self._drain_socket is None else self._drain_port(deadline_ns)
@@ -286,14 +286,10 @@ class DriveClient:
         self._error_cell[0] = code
         return EMERGENCY if code else 0
 
-    def warm_up(self, tick: Any) -> None:
-        """Bind, so that the first tick is like the others."""
-        self._bind(tick)
-
     def send(self, tick: Any) -> None:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:
-            self._bind(tick)
+            self.prepare(tick)
         if self._command is not None and not self._down:
             code = self._command()
             if code:

@@ -315,17 +315,15 @@ def opened_client(
 def _client(
     setup: Setup, on_frames: OnFrames | None = None, now: Callable[[], int] = time.monotonic_ns
 ) -> DriveClient:
-    """A drive client on a link of its own, warmed up."""
+    """A drive client on a link of its own."""
     load = setup.config.controller.kind == "fac"
     link: Link = open_link(bus_settings(setup.config))
     if setup.config.loop.clock == "lockstep":
         sync = setup.database.optional("SYNC")
         link = LockstepLink(link, sync.send_id if sync else None)
-    client = DriveClient(
+    return DriveClient(
         link, setup.database, load=load, drive_map=setup.binding.map, on_frames=on_frames, now=now
     )
-    client.warm_up(new_ticks()[0])
-    return client
 
 
 def check_arming(setup: Setup, arm: bool) -> None:

@@ -70,14 +70,13 @@ class GuardedDrive:
 
     def __init__(self, drive: Drive, words: Words, now: Callable[[], int]) -> None:
         self._drive, self._words, self._now = drive, words.cells, now
-        self._tick: Any = None
 
-    def _bind(self, tick: Any) -> None:
-        """Reach the fields of this tick; the loop hands in the same one each time."""
+    def prepare(self, tick: Any) -> None:
+        """Reach the fields of the record."""
         self._flags, self._state, self._counter = (
             cell(tick.base, name) for name in ("rx_flags", "state", "counter")
         )
-        self._tick = tick
+        self._drive.prepare(tick)
 
     def sync(self, tick: Any) -> None:
         """SYNC, unless the guardian has stopped the drive."""
@@ -88,8 +87,6 @@ class GuardedDrive:
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Feedback, and what the guardian did."""
-        if tick is not self._tick:
-            self._bind(tick)
         self._drive.receive(tick, deadline_ns)
         words = self._words
         if words[FIRED]:
@@ -99,8 +96,6 @@ class GuardedDrive:
 
     def send(self, tick: Any) -> None:
         """The command. Raises OSError once the guardian has stopped the drive; the record stays as it is."""
-        if tick is not self._tick:
-            self._bind(tick)
         words = self._words
         words[BEAT_NS] = self._now()
         words[ARMED] = self._state[0] != DISARMED

@@ -123,6 +123,7 @@ class Loop:
     def _run(self) -> None:
         tick: Any = self._ticks[0]
         clock, plan, outcome = self._clock, self._plan, self._outcome
+        self._drive.prepare(tick)
         start_ns = clock.now_ns()
         k = 0
         while True:

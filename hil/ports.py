@@ -13,6 +13,9 @@ from hil.signals import TickArray
 class Drive(Protocol):
     """A drive on a bus. ``tick`` is one record of :data:`hil.signals.TICK`, filled in place."""
 
+    def prepare(self, tick: Any) -> None:
+        """Get ready for this very record, which every tick fills; sends nothing. Once, before the first."""
+
     def sync(self, tick: Any) -> None:
         """Send SYNC: the drive latches the newest command, samples and answers with its feedback.
 

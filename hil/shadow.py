@@ -22,6 +22,10 @@ class ShadowDrive:
     def __init__(self, drive: Drive, applied: Applied) -> None:
         self._drive, self._applied = drive, applied
 
+    def prepare(self, tick: Any) -> None:
+        """Get ready for the record."""
+        self._drive.prepare(tick)
+
     def sync(self, tick: Any) -> None:
         """Send nothing: another controller sends SYNC."""
 

@@ -96,7 +96,7 @@ def take(data: bytes) -> None:
 
 def exchange(draw: Draw, link: Any) -> None:
     client, ticks = DriveClient(link, DATABASE), new_ticks()
-    client.warm_up(ticks[0])
+    client.prepare(ticks[0])
     while draw.rest():
         raw = [drawn_frame(draw) for _ in range(draw.below(6))]
         link.put(raw)

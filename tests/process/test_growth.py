@@ -27,8 +27,8 @@ class Answered:
 
     def __init__(self, client: DriveClient, peer: Any, answers: list[bytes]) -> None:
         self._client, self._peer, self._answers, self._k = client, peer, answers, 0
-        self.receive, self.send, self.stop, self.close = (
-            client.receive, client.send, client.stop, client.close,
+        self.prepare, self.receive, self.send, self.stop, self.close = (
+            client.prepare, client.receive, client.send, client.stop, client.close,
         )  # fmt: skip
 
     def sync(self, tick: Any) -> None:

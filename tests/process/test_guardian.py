@@ -188,6 +188,8 @@ class Quiet:
     def __init__(self) -> None:
         self.sent = 0
 
+    def prepare(self, tick: Any) -> None: ...
+
     def sync(self, tick: Any) -> None:
         self.sent += 1
 
@@ -209,6 +211,7 @@ def test_a_loop_that_hangs_is_stopped_and_stays_stopped() -> None:
         os.set_blocking(ours, False)
         drive, tick = Quiet(), new_ticks()[0]
         guarded = GuardedDrive(drive, words, time.monotonic_ns)
+        guarded.prepare(tick)
         time.sleep(0.2)  # not armed: silence is nothing
         with pytest.raises(BlockingIOError):
             os.read(ours, 100)

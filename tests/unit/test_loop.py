@@ -28,6 +28,9 @@ class ScriptedDrive:
         if self.calls.count(name) == self.fail_at.get(name):
             raise self.error(f"{name} failed")
 
+    def prepare(self, tick: Any) -> None:
+        self.calls.append("prepare")
+
     def sync(self, tick: Any) -> None:
         self._note("sync")
 

@@ -146,6 +146,7 @@ export PATH={shlex.quote(str(python))}:/usr/local/sbin:/usr/local/bin:/usr/sbin:
 export PYTHONPATH={shlex.quote(str(ROOT))} HOME=/dev/shm TMPDIR=/dev/shm OUT=/mnt LANG=C.UTF-8
 export NUMBA_CACHE_DIR=/dev/shm/numba PYTHONDONTWRITEBYTECODE=1 OPENBLAS_NUM_THREADS=1
 [ -d {shlex.quote(cache)} ] && cp -r {shlex.quote(cache)} /dev/shm/numba
+echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up
 for card in can0 can1; do

@@ -1,7 +1,7 @@
 """Instructions a tick, phase by phase: runs in the bench machine, where an instruction is a nanosecond.
 
-For each bus: a plain run of `hil run`, one with the meter of `hil bench` around the phases, and the bare loop
-against the same drive as the floor; on vcan0 a second plain run, to say how far two are apart. The thread's
+For each bus: three plain runs of `hil run`, two with the meter of `hil bench` around the phases, and the bare
+loop against the same drive as the floor. A stall of the machine only adds, so the lowest counts. The thread's
 processor time is read, so that waiting counts for nothing. Leaves $OUT/instructions.json.
 """
 
@@ -24,7 +24,6 @@ from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked
 SECONDS = 0.5
 ATTEMPTS = 3
 """A stall of the whole machine can end a run; a count is of a run that went to its end."""
-REPEATED = "vcan"
 BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
     # name: controller's interface, drive's interface, settings, settings of the plant
     "vcan": ("vcan0", "vcan0", (), ()),
@@ -101,8 +100,9 @@ class Bus:
     def measure(self) -> dict[str, Any]:
         self.emulator.until("ready")
         try:
-            runs = [self.plain(name) for name in ("first", "second")[: 1 + (self.name == REPEATED)]]
-            return {"runs": runs, "phases": self.phases(), "bare": self.bare()}
+            runs = [self.plain(name) for name in ("first", "second", "third")]
+            phases = min((self.phases() for _ in range(2)), key=lambda found: sum(found.values()))
+            return {"runs": sorted(runs), "phases": phases, "bare": self.bare()}
         finally:
             self.emulator.send_signal(signal.SIGTERM)
             self.emulator.wait()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +44,8 @@ class Forked:
             sys.stdout.flush()
         except SystemExit as error:
             code = int(error.code or 0)
+        except BaseException:  # noqa: BLE001 - nobody above would print it
+            traceback.print_exc()
         finally:
             os._exit(code)
 
