@@ -87,7 +87,7 @@ def test_read_judge_compute_write_record_in_order() -> None:
     drive = ScriptedDrive()
     loop, memory, _ = make(drive, FakeClock(), ticks=2)
     outcome = loop.run()
-    assert drive.calls == ["sync", "receive", "send"] * 2 + ["sync", "receive", "stop"]
+    assert drive.calls == ["prepare", *["sync", "receive", "send"] * 2, "sync", "receive", "stop"]
     assert [int(t["k"][0]) for t in memory.ticks] == [0, 1, 2]
     assert (outcome.ticks, outcome.skipped, outcome.reason) == (3, 0, Reason.STOP_REQUESTED)
 
