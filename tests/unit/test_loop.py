@@ -196,7 +196,7 @@ def test_trouble_on_the_bus_is_an_event_when_it_begins() -> None:
 def test_timer_pacing_takes_what_is_there_and_sends_no_sync() -> None:
     drive = ScriptedDrive()
     make(drive, FakeClock(), ticks=2, pacing="timer")[0].run()
-    assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"]
+    assert drive.calls == ["prepare", *["receive", "send"] * 2, "receive", "stop"]
 
 
 class SilentAtTimes(ScriptedDrive):
@@ -233,7 +233,7 @@ class CyclicDrive(ScriptedDrive):
 def test_feedback_pacing_is_woken_by_the_drive() -> None:
     drive, slept = CyclicDrive([]), []
     make(drive, FakeClock(on_sleep=slept.append), ticks=2, pacing="feedback")[0].run()
-    assert drive.calls == ["receive", "send"] * 2 + ["receive", "stop"] and slept == []
+    assert drive.calls == ["prepare", *["receive", "send"] * 2, "receive", "stop"] and slept == []
 
 
 def test_of_queued_feedback_the_newest_counts_and_the_others_are_skipped() -> None:
