@@ -6,9 +6,11 @@ STAMP := $(VENV)/.installed
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/numba
 JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py tests/unit/test_drivers*.py) \
     $(wildcard tests/unit/test_guard*.py tests/unit/test_supervisor*.py) tests/unit/test_protocol.py tests/property
+NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.23.0 \
+    @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash faults soak fuzz guided mutants
+.PHONY: gallery demo test lint unit interpreted vm clean help crash faults soak fuzz guided mutants node
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -38,6 +40,12 @@ interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage
 
 vm: $(STAMP) ## the tests on a real SocketCAN bus (natively or in the bench machine)
 	HIL_REQUIRE_VM=1 $(BIN)/python -m pytest -m vm tests/vm
+
+# Others' programs that read what we write; nothing of theirs is run while they install.
+node: ## JavaScript packages for the tests that need node, into .cache/node (200 MB)
+	@mkdir -p .cache/node
+	npm install --prefix .cache/node --save-exact --ignore-scripts --legacy-peer-deps --no-audit --no-fund \
+	    --loglevel=error $(NODE_PACKAGES)
 
 gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
 	$(BIN)/python docs/gallery/make.py

@@ -1,9 +1,7 @@
 """JavaScript programs in tests: readers and viewers that others wrote for what we write.
 
-HIL_NODE_MODULES names the node_modules folder in which the packages were installed:
-
-    npm install @mcap/core fzstd @foxglove/ws-protocol ws
-    npm install @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
+`make node` installs them into .cache/node; HIL_NODE_MODULES names another node_modules folder. Tests that
+need them are skipped without, and fail with HIL_REQUIRE_NODE=1.
 """
 
 from __future__ import annotations
@@ -14,20 +12,21 @@ from pathlib import Path
 
 import pytest
 
-MISSING = "node or its packages are not there: see tests/node.py"
+MISSING = "node or its packages are not there: make node"
+INSTALLED = Path(__file__).parents[1] / ".cache" / "node" / "node_modules"
 
 
 def node(script: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a script; the packages are looked for where HIL_NODE_MODULES says."""
-    env = os.environ | {"NODE_PATH": os.environ.get("HIL_NODE_MODULES", "")}
+    """Run a script that finds the packages."""
+    env = os.environ | {"NODE_PATH": str(modules())}
     return subprocess.run(
         ["node", "-e", script, *words], capture_output=True, text=True, timeout=120, env=env, check=False
     )
 
 
 def modules() -> Path:
-    """The folder that HIL_NODE_MODULES names."""
-    return Path(os.environ.get("HIL_NODE_MODULES", "node_modules"))
+    """The folder with the packages."""
+    return Path(os.environ.get("HIL_NODE_MODULES", INSTALLED))
 
 
 def has_packages(*names: str) -> bool:

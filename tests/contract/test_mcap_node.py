@@ -1,6 +1,6 @@
 """Our files in @mcap/core, the reader that Foxglove and Lichtblick are built on: every tick, to the bit.
 
-Needs node and the packages @mcap/core and fzstd, see tests/node.py. Skipped without.
+Needs node and the packages @mcap/core and fzstd: make node. Skipped without.
 """
 
 from __future__ import annotations
