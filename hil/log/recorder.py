@@ -40,7 +40,7 @@ def check_folder(path: Path, needed_bytes: int) -> None:
         if taken.exists():
             raise LogError(f"{taken}: exists already; choose another [log] name")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         probe = folder / f".{path.name}.{os.getpid()}.probe"
         probe.touch(exist_ok=False)
         probe.unlink()
