@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final
@@ -12,7 +12,16 @@ from typing import IO, Any, Final
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import AttachmentIndex, Channel, Footer, McapRecord, Metadata, MetadataIndex, Statistics
+from mcap.records import (
+    AttachmentIndex,
+    Channel,
+    Footer,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Statistics,
+    SummaryOffset,
+)
 
 from hil.log.container import MAGIC
 from hil.log.errors import DamagedError, LogError
@@ -27,6 +36,7 @@ _SUMMARY: Final[dict[int, Any]] = {
     Opcode.STATISTICS: Statistics,
     Opcode.ATTACHMENT_INDEX: AttachmentIndex,
     Opcode.METADATA_INDEX: MetadataIndex,
+    Opcode.SUMMARY_OFFSET: SummaryOffset,
 }
 
 
@@ -101,7 +111,7 @@ def _from_summary(path: Path, stream: IO[bytes]) -> Info:
     if not 0 < footer.summary_start < at or at - footer.summary_start > MAX_RECORD:
         raise DamagedError("there is no summary")
     out, topics, counts = Info(path, size), {}, {}
-    for record in _summary(stream, footer.summary_start, at):
+    for record in _wanted(stream, footer, at):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Statistics):
@@ -127,8 +137,21 @@ def _record_at(stream: IO[bytes], at: int, size: int) -> McapRecord | None:
     return parse(raw.opcode, raw.content)
 
 
-def _summary(stream: IO[bytes], start: int, end: int) -> list[Any]:
-    """Records of the summary section that say what is in the file."""
+def _wanted(stream: IO[bytes], footer: Footer, end: int) -> Iterator[Any]:
+    """Records of the summary that say what is in the file; the chunks' own, a few a second, are passed by."""
+    start, offsets = footer.summary_start, footer.summary_offset_start
+    if offsets == 0:  # a writer may leave them out
+        yield from _records(stream, start, end)
+        return
+    for group in _records(stream, offsets, end):
+        if isinstance(group, SummaryOffset) and group.group_opcode in _SUMMARY:
+            if not start <= group.group_start <= offsets - group.group_length:
+                raise DamagedError("an offset points out of the summary")
+            yield from _records(stream, group.group_start, group.group_start + group.group_length)
+
+
+def _records(stream: IO[bytes], start: int, end: int) -> list[Any]:
+    """Records of the kinds in ``_SUMMARY`` between two places."""
     out, at = [], start
     stream.seek(start)
     while at < end:

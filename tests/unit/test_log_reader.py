@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 import struct
 import tracemalloc
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -322,6 +324,44 @@ def test_info_reads_the_summary(tmp_path: Path, whole: bytes) -> None:
     assert found.attachments == {name: len(text) for name, text in HEADER["attachments"].items()}
     assert json.loads(found.metadata["result"]["result"])["ended"] == "stop_requested"
     assert json.dumps(found.as_dict())
+
+
+class Counting(io.FileIO):
+    """A file that counts the bytes that are read from it."""
+
+    taken = 0
+
+    def readinto(self, buffer: Any) -> int:
+        got = super().readinto(buffer)
+        self.taken += got
+        return got
+
+
+def taken_by_info(path: Path, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Bytes that `info` reads of a file."""
+    file = Counting(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", lambda *_: io.BufferedReader(file, 512))
+        assert info(path).damage is None
+    return file.taken
+
+
+def test_info_reads_as_much_of_a_long_log_as_of_a_short_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short, long = tmp_path / "short.mcap", tmp_path / "long.mcap"
+    write_log(short, TICKS[:10], FRAMES[:40], block=1)
+    write_log(long, some_ticks(4000), some_frames(16000), block=1)
+    assert long.stat().st_size > 100 * short.stat().st_size
+    assert info(long).counts["/tick"] == 4000
+    least, most = (taken_by_info(path, monkeypatch) for path in (short, long))
+    assert 0 < most <= least + 4 * 512  # where buffers begin
+
+
+def test_info_reads_a_summary_without_offsets(tmp_path: Path, whole: bytes) -> None:
+    at = len(whole) - len(container.MAGIC) - 20 + 8  # of the footer: where the offsets begin
+    found = info(saved(tmp_path, whole[:at] + bytes(8) + whole[at + 8 :]))
+    assert found.counts["/tick"] == 500 and found.damage is None
 
 
 def test_info_of_a_cut_off_log_counts_what_is_there(tmp_path: Path, whole: bytes) -> None:
