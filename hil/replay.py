@@ -5,6 +5,7 @@ A pure fold: same inputs, same config, same code. Exit codes: 0 same, 1 differs,
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -151,6 +152,8 @@ def bits(values: npt.NDArray[Any], kind: str) -> npt.NDArray[np.int64]:
 
 def compare(logged: TickArray, again: TickArray) -> Difference | None:
     """The first tick and field whose bits differ."""
+    if logged.tobytes() == again.tobytes():
+        return None
     first: tuple[int, str] | None = None
     for name in OUTPUTS:
         a, b = np.ascontiguousarray(logged[name]), np.ascontiguousarray(again[name])
@@ -175,25 +178,35 @@ class Window:
     def of(self, ticks: TickArray, first_ns: int) -> TickArray:
         """The ticks inside."""
         at = (ticks["t_ns"] - np.uint64(first_ns)) * 1e-9
-        inside: TickArray = ticks[(at >= self.start_s) & (at <= self.end_s)]
-        return inside
+        inside = (at >= self.start_s) & (at <= self.end_s)
+        chosen: TickArray = ticks if inside.all() else ticks[inside]  # choosing copies field by field
+        return chosen
 
 
 @dataclass(slots=True)
-class _Replay:
+class Replay:
     """One pass over a log's ticks, block by block; memory holds one block."""
 
     log: Log
-    window: Window
+    window: Window = dataclasses.field(default_factory=Window)
     machine: Machine | None = None
     first_ns: int = 0
     last_k: int = -1
     ticks: int = 0
     compared: int = 0
     why: str = ""
+    impossible: str = ""
     difference: Difference | None = None
 
-    def begin(self, ticks: TickArray) -> bool:
+    def feed(self, ticks: TickArray) -> bool:
+        """Take the next ticks; False when there is no more to learn."""
+        try:
+            return not self.impossible and (len(ticks) == 0 or self._take(ticks))
+        except (HilError, ValueError) as error:
+            self.impossible = str(error)
+            return False
+
+    def _begin(self, ticks: TickArray) -> bool:
         """Design the controller at the first tick; False when the run's beginning is missing."""
         self.first_ns, self.last_k = int(ticks["t_ns"][0]), int(ticks["k"][0]) - int(ticks["gap"][0])
         kept = self.log.attachments.get(STATE)
@@ -206,11 +219,11 @@ class _Replay:
             self.machine = machine_of(self.log).fresh()
         return True
 
-    def take(self, ticks: TickArray) -> bool:
+    def _take(self, ticks: TickArray) -> bool:
         """Fold and compare a block; False when there is no more to learn."""
-        if self.machine is None and not self.begin(ticks):
+        if self.machine is None and not self._begin(ticks):
             return False
-        assert self.machine is not None  # noqa: S101 - begin made it
+        assert self.machine is not None  # noqa: S101 - _begin made it
         whole = self._before_gap(ticks)
         if len(whole):
             again = refold(self.machine, whole)
@@ -237,6 +250,8 @@ class _Replay:
 
     def verdict(self) -> Verdict:
         """What the pass found; ``log.damage`` is known by now."""
+        if self.impossible:
+            return Verdict("cannot", 0, why=self.impossible)
         if self.difference is not None:
             return Verdict("differs", self.compared, self.difference, self.log.damage or "")
         if self.why:
@@ -247,9 +262,9 @@ class _Replay:
         return Verdict("same", self.compared, why=self.log.damage or "")
 
 
-def _run(replay: _Replay, blocks: Iterable[TickArray], seen: Callable[[int], None]) -> Verdict:
+def _run(replay: Replay, blocks: Iterable[TickArray], seen: Callable[[int], None]) -> Verdict:
     for ticks in blocks:
-        more = len(ticks) == 0 or replay.take(ticks)
+        more = replay.feed(ticks)
         seen(replay.ticks)
         if not more:
             break
@@ -258,7 +273,7 @@ def _run(replay: _Replay, blocks: Iterable[TickArray], seen: Callable[[int], Non
 
 def replay_log(log: Log) -> Verdict:
     """Replay a log that has been read."""
-    return _run(_Replay(log, Window()), [log.ticks], lambda _: None)
+    return _run(Replay(log), [log.ticks], lambda _: None)
 
 
 def tick_blocks(log: Log) -> Iterator[TickArray]:
@@ -277,6 +292,6 @@ def replay(
     """
     try:
         log = new_log(source)
-        return _run(_Replay(log, window or Window()), tick_blocks(log), seen or (lambda _: None))
+        return _run(Replay(log, window or Window()), tick_blocks(log), seen or (lambda _: None))
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))

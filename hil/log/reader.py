@@ -42,6 +42,14 @@ Source = Path | Sequence[Path]
 MEMORY_SHARE: Final = 0.5
 SLAB_TICKS: Final = 1 << 17  # 48 MB, above the size up to which malloc keeps freed memory
 _WHOLE: Final = np.dtype(f"V{TICK.itemsize}")  # copied at once, where TICK is copied field by field
+_TAG_BYTES: Final = np.concatenate(
+    [
+        np.arange(at, at + kind.itemsize)
+        for name, (kind, at, *_) in (TICK.fields or {}).items()
+        if name[0] == "_"
+    ]
+)
+_TAGS: Final = new_ticks(1).view(np.uint8)[_TAG_BYTES]
 FRAME_OBJECT_RATIO: Final = 4  # a Frame object over its 78-byte record
 
 
@@ -258,9 +266,8 @@ class _Pass:
 
     def _ticks(self, ticks: TickArray) -> Block:
         """Count ticks; their tags must be those of the layout, or every value would be another's."""
-        own = new_ticks(1)
-        tags = [name for name in TICK.names or () if name.startswith("_")]
-        if any((ticks[name] != own[name]).any() for name in tags):
+        raw = ticks.view(np.uint8).reshape(len(ticks), TICK.itemsize)
+        if (raw[:, _TAG_BYTES] != _TAGS).any():
             raise DamagedError("tick records whose tags do not fit")
         self.log.tick_count += len(ticks)
         self.log.last_t_ns = int(ticks["t_ns"][-1])

@@ -13,7 +13,7 @@ from hil.config import RunConfig, validate
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
 from hil.log.reader import Log, Source, new_log, read_blocks
-from hil.replay import Verdict, machine_of, replay
+from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
 from hil.report.frames import Frames, FrameTime, names_of
@@ -140,12 +140,13 @@ class Run:
 def collect(source: Source, *, verify: bool = True) -> Run:
     """Read a log, and replay it when ``verify``. Raises LogError for what is no log of hil."""
     log = new_log(source)
-    run = Run(log, log.path.stem)
+    run, again, more = Run(log, log.path.stem), Replay(log), verify
     for block in read_blocks(log):
         if not len(block.records):
             continue
         if block.kind == "ticks":
             run.feed(block.records)
+            more = more and again.feed(block.records)
         else:
             run.frames.feed(block.records)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -153,5 +154,5 @@ def collect(source: Source, *, verify: bool = True) -> Run:
     if run.config is None and not run.config_problem:  # there was no tick
         run.read_config()
     if verify:
-        run.verdict = replay(source)
+        run.verdict = again.verdict()
     return run

@@ -132,12 +132,12 @@ class Totals:
     def feed(self, t: F8, ticks: TickArray) -> None:
         """Take the next ticks, at times ``t`` [s]."""
         on = ticks["state"] == int(DriveState.OPERATION_ENABLED)
-        own, fresh = ticks[on], (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
-        error = np.abs(own["w"] - own["w_ref"])
+        fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
+        error = np.abs(ticks["w"] - ticks["w_ref"])[on]
         finite = np.isfinite(error)
         self.ticks += len(ticks)
         self.skipped += int(ticks["skipped"].sum(dtype=np.int64))
-        self.operating += len(own)
+        self.operating += len(error)
         self.lost += int((on & ~fresh).sum())
         self.not_a_number += int((~np.isfinite(ticks["w"])).sum())
         self.squared_error += float(np.sum(error[finite] ** 2))
@@ -154,10 +154,12 @@ class Totals:
         self._k = int(k[-1])
 
     def _count(self, ticks: TickArray) -> None:
-        for flag in (*RxFlag, *GuardFlag):
-            column = "rx_flags" if isinstance(flag, RxFlag) else "guard_flags"
-            name = f"{'bus' if isinstance(flag, RxFlag) else 'guard'}: {flag.name.lower().replace('_', ' ')}"
-            self.flags[name] = self.flags.get(name, 0) + int(((ticks[column] & int(flag)) != 0).sum())
+        for where, column, kind in (("bus", "rx_flags", RxFlag), ("guard", "guard_flags", GuardFlag)):
+            words, counts = np.unique(ticks[column], return_counts=True)
+            for flag in kind:
+                name = f"{where}: {flag.name.lower().replace('_', ' ')}"
+                seen = int(counts[(words & int(flag)) != 0].sum())
+                self.flags[name] = self.flags.get(name, 0) + seen
         counts = np.bincount(np.minimum(ticks["state"], len(STATE_NAMES) - 1), minlength=len(STATE_NAMES))
         for name, count in zip(STATE_NAMES, counts.tolist(), strict=True):
             self.states[name] = self.states.get(name, 0) + count
