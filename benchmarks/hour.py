@@ -122,7 +122,10 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="make the logs there, or take them there")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        found = list(costs(args.keep or Path(name), args.endings))
+        found = []
+        for one in costs(args.keep or Path(name), args.endings):
+            found.append(one)
+            sys.stderr.write(f"{one.seconds:.0f} s: {one.command}\n")
     if args.json:
         sys.stdout.write(json.dumps([asdict(one) for one in found], indent=2) + "\n")
         return

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hil.convert.frame import need, title
+from hil.log.errors import LogError
 from hil.log.reader import Log, Source, open_log
 from hil.signals import FIELDS, TickArray
 
@@ -95,10 +96,12 @@ class Mf4Table:
 def write_mat(path: Path, source: Source) -> Log:
     """MATLAB 5 file: a vector a field, structs ``units``, ``meanings`` and ``run``.
 
-    Holds all ticks in memory; raises LogError when they do not fit into half of it.
+    Holds all ticks in memory; raises LogError when they do not fit into half of it, and when there are none.
     """
     savemat = need("scipy.io", "MAT").savemat
     log = open_log(source, frames=False)
+    if not len(log.ticks):
+        raise LogError(f"{log.path}: holds no ticks")
     columns: dict[str, Any] = dict(zip([f.name for f in FIELDS], _columns(log.ticks), strict=True))
     columns["units"] = {f.name: f.unit for f in FIELDS}
     columns["meanings"] = {f.name: f.doc for f in FIELDS}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 from hil.report.collect import Run
+from hil.signals import Reason
 
 Outcome = Literal["pass", "fail", "no data"]
 
@@ -110,6 +111,26 @@ def open_loop(run: Run) -> str:
     )
 
 
+def ending(run: Run) -> str:
+    """How a run ended that nobody asked to end, in words; empty for one that was, and for no run."""
+    if _asked(run) or open_loop(run) or run.log.metadata.get("run", {}).get("kind") == "import":
+        return ""
+    last = f"; its last tick is at {run.span_s:.3f} s" if run.totals.ticks else ""
+    if not run.log.result:
+        return f"how the run ended is not known, its log breaks off{last}"
+    if run.ended == "controller died":
+        return f"the controller died, what it had handed over was still written{last}"
+    if run.ended.upper() in Reason.__members__:
+        return f"the run ended in a trip, {run.ended.replace('_', ' ')}{last}"
+    return f"the run ended: {run.ended}{last}"
+
+
+def recovered(run: Run) -> str:
+    """What is known of the file that a recovered log was made from; empty for any other log."""
+    found = run.log.metadata.get("recovered")
+    return f"recovered from {found.get('from', 'a log')}, {found.get('damage', 'none')}" if found else ""
+
+
 def limits(run: Run) -> dict[str, float]:
     """What the config demands: figure key to largest value; ``dip_max_rad_s`` limits ``dip_rad_s``."""
     if run.config is None or open_loop(run):
@@ -132,8 +153,7 @@ def _limit(run: Run, figure: Figure, most: float) -> Check:
 
 def _always(run: Run) -> list[Check]:
     """Ended as asked, log whole, nothing dropped, replay the same."""
-    asked = run.ended in ("stop_requested", "quick_stop_requested") or run.ended.startswith("goes on in ")
-    ended: Outcome = "no data" if open_loop(run) else _outcome(asked)
+    ended: Outcome = "no data" if open_loop(run) else _outcome(_asked(run))
     missing = run.totals.missing
     whole = run.log.damage is None and bool(run.log.result) and missing == 0
     found = run.log.damage or (f"{missing} records missing" if missing else "complete")
@@ -144,6 +164,11 @@ def _always(run: Run) -> list[Check]:
         Check("log", _outcome(whole), found if run.log.result else f"{found}; no result", "complete"),
         Check("replay", replayed, verdict_text(run), "same to the bit"),
     ]
+
+
+def _asked(run: Run) -> bool:
+    """Whether the run ended as it was asked to, or goes on in another part."""
+    return run.ended in ("stop_requested", "quick_stop_requested") or run.ended.startswith("goes on in ")
 
 
 def _outcome(good: bool) -> Outcome:

@@ -18,10 +18,12 @@ from hil.report.criteria import (
     FIGURES,
     SIGNS,
     Check,
+    ending,
     figures,
     judge,
     number,
     open_loop,
+    recovered,
     verdict_text,
 )
 from hil.report.curves import PLOTS, limits_text
@@ -92,8 +94,9 @@ def summary(runs: Sequence[Run]) -> str:
 
 
 def _notes(run: Run) -> str:
-    """What is wrong with a log, said at the top."""
-    notes = [text for text in (run.log.damage, run.config_problem, open_loop(run)) if text]
+    """How a run ended that was not asked to, and what is wrong with its log, said at the top."""
+    texts = (ending(run), run.log.damage, recovered(run), run.config_problem, open_loop(run))
+    notes = [text for text in texts if text]
     if run.totals.ticks == 0:
         notes.append("the log has no ticks: there is nothing to draw")
     if run.totals.missing:
