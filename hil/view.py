@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from hil.app import RunResult
-from hil.replay import Verdict
 from hil.signals import Reason
-from hil.whatif import WhatIf
+
+if TYPE_CHECKING:  # a table must not wait for the compiler and the bus
+    from hil.app import RunResult
+    from hil.replay import Verdict
+    from hil.whatif import WhatIf
 
 
 def show(table: Table) -> None:

@@ -6,6 +6,8 @@ import io
 import json
 import random
 import struct
+import subprocess
+import sys
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -356,6 +358,15 @@ def test_info_reads_as_much_of_a_long_log_as_of_a_short_one(
     assert info(long).counts["/tick"] == 4000
     least, most = (taken_by_info(path, monkeypatch) for path in (short, long))
     assert 0 < most <= least + 4 * 512  # where buffers begin
+
+
+def test_info_waits_for_neither_compiler_nor_bus(tmp_path: Path, whole: bytes) -> None:
+    script = "import sys; from hil.cli import main; main(sys.argv[1:]); print(*sys.modules, file=sys.stderr)"
+    words = (sys.executable, "-c", script, "info", str(saved(tmp_path, whole)))
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
+    assert "stop_requested" in done.stdout
+    loaded = set(done.stderr.split())
+    assert "hil.log.info" in loaded and not loaded & {"numba", "scipy", "can", "cantools", "pandas"}
 
 
 def test_info_reads_a_summary_without_offsets(tmp_path: Path, whole: bytes) -> None:
