@@ -65,7 +65,7 @@ fuzz: $(STAMP) ## mutated files, frames, commands and ticks; prints the inputs t
 guided: $(STAMP) ## the same with coverage as the guide: needs pip install -e '.[fuzz]' (SECONDS_EACH=60 SEED=1)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.fuzz.guided --seconds $(or $(SECONDS_EACH),60) --seed $(or $(SEED),1)
 
-mutants: $(STAMP) ## change guard and supervisor, one place at a time: do their tests notice? (SAMPLE=0: all, SEED=1)
+mutants: $(STAMP) ## change guard, supervisor, guardian, one place at a time: do tests notice? (SAMPLE=0: all, SEED=1)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.mutation.mutants --sample $(or $(SAMPLE),0) --seed $(or $(SEED),1)
 
 clean: ## remove the virtual environment and caches

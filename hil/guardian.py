@@ -115,27 +115,45 @@ class GuardedDrive:
         self._drive.close()
 
 
+class Judge:
+    """What the guardian makes of the shared words: how long to wait, and when to send the stop frames."""
+
+    def __init__(self, words: Words, timeout_ns: int, stopper: Stopper) -> None:
+        self._cells, self._timeout_ns, self._stopper = words.cells, timeout_ns, stopper
+        self._answered = 0
+
+    def wait_ms(self, now_ns: int) -> int:
+        """Beat, and answer a sign of life after the latch; return the time to the next look [ms]."""
+        cells = self._cells
+        beat = cells[BEAT_NS]
+        if cells[FIRED] and beat != self._answered:  # once more: a frame may have been on its way
+            self._answered = beat
+            self._stopper.stop_from(cells[COUNTER])
+        cells[GUARD_NS] = now_ns
+        left_ns = beat + self._timeout_ns - now_ns if self._watching() else self._timeout_ns
+        return int(max(left_ns, 0) // 1_000_000 + (left_ns > 0))
+
+    def judge(self, now_ns: int, gone: bool) -> None:
+        """Fire, once, when the controller is gone or was silent for longer than the timeout while armed."""
+        cells = self._cells
+        if self._watching() and (gone or now_ns - cells[BEAT_NS] > self._timeout_ns):
+            cells[FIRED] = 1
+            self._answered = cells[BEAT_NS]
+            for _ in range(STOPS):
+                self._stopper.stop_from(cells[COUNTER])
+
+    def _watching(self) -> bool:
+        return bool(self._cells[ARMED] and not self._cells[FIRED])
+
+
 def watch(words: Words, parent_fd: int, timeout_ns: int, stopper: Stopper) -> None:
     """Watch until the controller has gone; fire when it dies or is silent for ``timeout_ns`` while armed."""
-    cells, now, poll = words.cells, RealClock().now_ns, select.poll()
+    now, poll, judge = RealClock().now_ns, select.poll(), Judge(words, timeout_ns, stopper)
     poll.register(parent_fd, select.POLLIN)
-    answered = 0
-    while True:
-        beat = cells[Word.BEAT_NS]
-        if cells[Word.FIRED] and beat != answered:  # a sign of life after the latch: once more
-            answered = beat
-            stopper.stop_from(cells[Word.COUNTER])
-        cells[Word.GUARD_NS] = now()
-        left_ns = beat + timeout_ns - now() if cells[Word.ARMED] and not cells[Word.FIRED] else timeout_ns
-        gone = bool(poll.poll(max(left_ns, 0) // 1_000_000 + (left_ns > 0)))
-        silent = now() - cells[Word.BEAT_NS] > timeout_ns
-        if cells[Word.ARMED] and not cells[Word.FIRED] and (gone or silent):
-            cells[Word.FIRED] = 1
-            answered = cells[Word.BEAT_NS]
-            for _ in range(STOPS):
-                stopper.stop_from(cells[Word.COUNTER])
-        if gone:
-            return
+    gone = False
+    while not gone:
+        gone = bool(poll.poll(judge.wait_ms(now())))
+        judge.judge(now(), gone)
 
 
 def _serve(

@@ -1,4 +1,4 @@
-"""Mutation testing of guard and supervisor: change one thing, run their tests, count what is not noticed.
+"""Mutation testing of guard, supervisor and guardian: change one thing, count what their tests miss.
 
     NUMBA_DISABLE_JIT=1 python -m tests.mutation.mutants [--sample 60 --seed 1]
 
@@ -20,6 +20,7 @@ import random
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from functools import reduce
 from pathlib import Path
 from types import FunctionType
@@ -29,10 +30,16 @@ import pytest
 
 from tests.mutation.operators import ROOT, Mutant, mutants
 
-FILES = ("hil/guard.py", "hil/supervisor.py")
-TESTS = tuple(
-    f"tests/unit/test_{name}.py" for name in ("guard", "guard_limits", "supervisor_rules", "supervisor")
-)
+SAFETY = ("test_guard.py", "test_guard_limits.py", "test_supervisor_rules.py", "test_supervisor.py")
+JUDGES = {
+    "hil/guard.py": SAFETY,
+    "hil/supervisor.py": SAFETY,
+    "hil/guardian.py": ("test_guardian.py",),
+}
+"""The tests of tests/unit that judge the mutants of a file."""
+FILES = tuple(JUDGES)
+PROCESSES = ("_serve", "guardian", "_await_ready", "START_S")
+"""What forks, and the fork: tests/process/test_guardian.py tests that with processes, too slow for this."""
 EQUIVALENT = Path(__file__).with_name("equivalent.txt")
 BROKEN = 70
 """Exit status of a child that failed outside the tests."""
@@ -53,7 +60,7 @@ def put_in_place(mutant: Mutant) -> None:
     code = compile(ast.Module([mutant.tree], []), f"<mutant of {mutant.name}>", "exec")
     names: dict[str, Any] = {}
     exec(code, module.__dict__, names)  # noqa: S102 - the repository's own source, with one change
-    made = names[mutant.name]
+    made = names[mutant.name.rpartition(".")[2]]
     if not isinstance(made, FunctionType):
         setattr(module, mutant.name, made)
         return
@@ -113,13 +120,14 @@ class Hunt:
         try:
             if mutant is not None:
                 put_in_place(mutant)
-            noticed = self._run(session)
+            noticed = self._run(session, mutant)
         finally:
             os._exit(noticed)
 
-    def _run(self, session: pytest.Session) -> int:
+    def _run(self, session: pytest.Session, mutant: Mutant | None) -> int:
         """Run the tests, those that noticed most mutants first, then quick before slow ones; 0 when green."""
-        order = sorted(range(len(session.items)), key=lambda i: (-self._noticed[i], self._took_ns[i]))
+        judges = [i for i, item in enumerate(session.items) if mutant is None or judged(item, mutant)]
+        order = sorted(judges, key=lambda i: (-self._noticed[i], self._took_ns[i]))
         items = [session.items[i] for i in order]
         for i, item, following in zip(order, items, [*items[1:], None], strict=True):
             begun = time.process_time_ns()
@@ -131,10 +139,15 @@ class Hunt:
         return 0
 
 
-def chosen(sample: int, seed: int) -> list[Mutant]:
+def judged(item: pytest.Item, mutant: Mutant) -> bool:
+    """True when this test is one for the mutant's file."""
+    return item.path.name in JUDGES[mutant.file]
+
+
+def chosen(files: Sequence[str], sample: int, seed: int) -> list[Mutant]:
     """All mutants, or as many of them, drawn with the seed."""
-    found = [mutant for file in FILES for mutant in mutants(file)]
-    return random.Random(seed).sample(found, sample) if sample else found
+    found = [mutant for file in files for mutant in mutants(file) if mutant.name not in PROCESSES]
+    return random.Random(seed).sample(found, min(sample, len(found))) if sample else found
 
 
 def main() -> int:
@@ -142,28 +155,31 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--sample", type=int, default=0, help="only so many, drawn with the seed")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--file", choices=FILES, help="mutants of this one alone")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     args = parser.parse_args()
     if os.environ.get("NUMBA_DISABLE_JIT") != "1":
         parser.error("set NUMBA_DISABLE_JIT=1: compiled code has no source to change")
     os.chdir(ROOT)
-    hunt, begun = Hunt(chosen(args.sample, args.seed), args.workers), time.monotonic()
+    files = (args.file,) if args.file else FILES
+    hunt, begun = Hunt(chosen(files, args.sample, args.seed), args.workers), time.monotonic()
     skipped = "not random and not whatever"
     quiet = ["-o", "addopts=", "-p", "no:terminal", "-p", "no:cacheprovider"]
-    pytest.main([*quiet, "-x", "-k", skipped, *TESTS], [hunt])
+    tests = sorted({f"tests/unit/{name}" for file in files for name in JUDGES[file]})
+    pytest.main([*quiet, "-x", "-k", skipped, *tests], [hunt])
     if not hunt.green:
         print("the tests are not green without a mutant")
         return 1
-    return report(hunt, time.monotonic() - begun)
+    return report(hunt, files, time.monotonic() - begun)
 
 
-def report(hunt: Hunt, seconds: float) -> int:
+def report(hunt: Hunt, files: Sequence[str], seconds: float) -> int:
     """Print what became of the mutants."""
     reasons = explained()
     unexplained = [mutant for mutant in hunt.alive if mutant.key not in reasons]
     equivalent = len(hunt.alive) - len(unexplained)
     counted = len(hunt.hunted) - equivalent
-    print(f"{len(hunt.hunted)} mutants of {' and '.join(FILES)} in {seconds:.0f} s: {equivalent} equivalent;")
+    print(f"{len(hunt.hunted)} mutants of {', '.join(files)} in {seconds:.0f} s: {equivalent} equivalent;")
     print(f"{counted - len(unexplained)} of the other {counted} noticed")
     for mutant in unexplained:
         print(f"SURVIVED line {mutant.line} of {mutant.key}")

@@ -158,6 +158,10 @@ def mutants(file: str) -> list[Mutant]:
         match node:
             case ast.FunctionDef(name=name):
                 found += mutate(file, name, stripped(node))
+            case ast.ClassDef(name=name, body=body):
+                methods = [each for each in body if isinstance(each, ast.FunctionDef)]
+                for method in methods:
+                    found += mutate(file, f"{name}.{method.name}", stripped(method))
             case ast.AnnAssign(target=ast.Name(id=name), value=ast.Constant(value=int())):
                 found += mutate(file, name, ast.copy_location(ast.Assign([node.target], node.value), node))
             case ast.Assign(targets=[ast.Name(id=name)], value=ast.Constant(value=int())):
