@@ -121,6 +121,12 @@ def restored(machine: Machine, text: str) -> tuple[Machine, int]:
         raise HilError(f"the kept state is not usable ({error})") from error
 
 
+def state_text(machine: Machine, k: int) -> str:
+    """A machine's state after tick ``k``, as :func:`restored` reads it."""
+    states = {"safety_state": machine.safety_state, "law_state": machine.law_state}
+    return json.dumps({"k": k} | {name: state.tobytes().hex() for name, state in states.items()})
+
+
 def set_inputs(ticks: TickArray, logged: TickArray) -> None:
     """Copy times and inputs of the logged ticks; every output is left to be computed."""
     for field in FIELDS:

@@ -14,7 +14,7 @@ import numpy as np
 
 from hil.design import Machine
 from hil.log.reader import Log
-from hil.replay import machine_of
+from hil.replay import machine_of, state_text
 from hil.signals import TickArray, new_ticks
 
 
@@ -42,10 +42,8 @@ class StateFollower:
 
     def state(self) -> str:
         """JSON: the last tick, and the bytes of both states unless they are not known."""
-        out: dict[str, Any] = {"k": self._last_k}
-        if self._machine is not None:
-            out |= {
-                "safety_state": self._machine.safety_state.tobytes().hex(),
-                "law_state": self._machine.law_state.tobytes().hex(),
-            }
-        return json.dumps(out)
+        return (
+            json.dumps({"k": self._last_k})
+            if self._machine is None
+            else state_text(self._machine, self._last_k)
+        )

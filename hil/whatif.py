@@ -21,9 +21,10 @@ from hil.control.law import FAC
 from hil.design import Machine, build
 from hil.errors import HilError
 from hil.log.mcapfile import RunFile
-from hil.log.reader import Log, LogError
+from hil.log.reader import Log, LogError, Source, new_log
 from hil.log.recorder import check_folder
-from hil.replay import machine_of, refold, set_inputs, tick_blocks, wire_of_log
+from hil.log.split import STATE
+from hil.replay import machine_of, refold, set_inputs, state_text, tick_blocks, wire_of_log
 from hil.signals import FIELDS, DriveState, TickArray, new_ticks
 
 COMPARED: Final = ("d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "i_q_ref", "u_q_law", "u_d_law")
@@ -128,17 +129,18 @@ def header(log: Log, config: Path, machine: Machine, used: RunConfig) -> dict[st
         "config.json": shadow.model_dump_json(),
         "controller.json": machine.to_json(),
     }
+    if STATE in log.attachments:  # a part of a run: the new controller begins with it, whatever its number
+        new[STATE] = state_text(machine, json.loads(log.attachments[STATE])["k"])
     run = log.metadata.get("run", {}) | {"kind": "what-if", "of": log.path.name}
     return {"metadata": run, "attachments": log.attachments | new}
 
 
-def what_if(path: Path, config_path: Path, config: RunConfig, out: Path | None = None) -> WhatIf:
+def what_if(source: Source, config_path: Path, config: RunConfig, out: Path | None = None) -> WhatIf:
     """Run the controller of ``config`` over a log; ``out`` gets the ticks. Raises HilError."""
-    if not path.is_file():
-        raise LogError(f"{path}: no such file")
+    log = new_log(source)
     if out is not None:
-        check_folder(out.resolve(), path.stat().st_size)
-    log, found = Log(path, new_ticks(0)), WhatIf(path, config_path, written=out)
+        check_folder(out.resolve(), sum(path.stat().st_size for path in log.parts or (log.path,)))
+    found = WhatIf(log.path, config_path, written=out)
     machine: Machine | None = None
     file: RunFile | None = None
     try:
@@ -155,5 +157,5 @@ def what_if(path: Path, config_path: Path, config: RunConfig, out: Path | None =
         if file:
             file.finish({"ended": "what-if", "ticks": found.ticks, "skipped": 0})
     if machine is None:
-        raise LogError(f"{path}: {log.damage or 'the log has no ticks'}")
+        raise LogError(f"{log.path}: {log.damage or 'the log has no ticks'}")
     return found

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, print_json, say
+from hil.commands.common import Commands, one_run, print_json, say
 
 if TYPE_CHECKING:
     from hil.replay import Verdict, Window
@@ -46,8 +46,8 @@ def cmd_replay(args: argparse.Namespace) -> int:
 
     end = float("inf") if args.end is None else args.end
     if args.config:
-        if len(args.logs) > 1 or args.junit or args.start or args.end is not None:
-            raise HilError("--config takes one log and no --junit, --from or --to")
+        if args.junit or args.start or args.end is not None:
+            raise HilError("--config takes no --junit, --from or --to")
         return _what_if(args)
     if args.output:
         raise HilError("-o needs --config; a replay itself writes nothing")
@@ -100,7 +100,7 @@ def _what_if(args: argparse.Namespace) -> int:
     from hil.whatif import what_if
 
     config = load_toml(args.config, RunConfig, [])
-    found = what_if(args.logs[0], args.config, config, args.output)
+    found = what_if(one_run(args.logs), args.config, config, args.output)
     if args.json:
         print_json(found.as_dict())
     else:

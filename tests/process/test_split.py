@@ -100,6 +100,29 @@ def test_commands_take_parts_as_one_run(parts: list[Path], whole: Any, tmp_path:
     assert checks["ended"] == checks["log"] == checks["replay"] == "pass", checks
 
 
+def test_another_controller_over_the_parts_is_as_over_the_whole(
+    parts: list[Path], whole: Any, tmp_path: Path, capsys: Any
+) -> None:
+    settings = ("loop.duration_s=3.2", f'log.folder="{tmp_path}"', 'log.name="one"')
+    one = simulate(load_setup(CONFIGS / "demo.toml", Overrides(settings=settings)), [])["log"]
+    new = tmp_path / "new.toml"
+    text = (CONFIGS / "demo.toml").read_text().replace("delay_ms = 12.0", "delay_ms = 40.0")
+    new.write_text(text.replace('"drives/', f'"{CONFIGS}/drives/'))
+    found = []
+    for name, logs in (("a", [one]), ("b", [str(path) for path in reversed(parts)]), ("c", [str(parts[2])])):
+        out = tmp_path / f"{name}.mcap"
+        assert main(["replay", *logs, "--config", str(new), "-o", str(out), "--json"]) == 0
+        found.append(json.loads(capsys.readouterr().out))
+        assert replay(out).verdict == "same"
+    assert found[0]["ticks"] == found[1]["ticks"] == len(whole)
+    for a, b in zip(found[0]["rows"], found[1]["rows"], strict=True):
+        assert a == b | {"rms": pytest.approx(b["rms"], rel=1e-12)}  # the blocks that are summed are others
+    assert same_ticks(open_log(tmp_path / "a.mcap").ticks, open_log(tmp_path / "b.mcap").ticks)
+    assert found[2]["ticks"] == 1000 and found[0]["rows"][0]["rms"] > 0
+    assert main(["replay", str(parts[0]), one, "--config", str(new)]) == 2
+    assert "no parts of one run" in capsys.readouterr().err
+
+
 def test_a_part_that_is_missing_is_a_gap(parts: list[Path]) -> None:
     verdict = replay((parts[0], parts[2]))
     assert verdict.verdict == "cannot" and "1000 records are missing before tick 2000" in verdict.why
