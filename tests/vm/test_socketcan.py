@@ -284,6 +284,27 @@ def test_the_log_carries_what_the_kernel_says_of_the_interface(socketcan: Path, 
     assert frames[1] > frames[0] + 500
 
 
+def test_steps_of_the_wall_clock_disturb_no_tick(socketcan: Path) -> None:
+    """An hour on, two back, one on: candump's stamps jump, deadlines and the log's stamps do not."""
+    if (socketcan / "clock_steps.skipped").exists():
+        pytest.skip("the clock of a real host is not set")
+    run = seen(socketcan, "clock_steps")
+    wall = np.array([t for t, _, _ in timed_frames_of(run.folder / "candump.log")])
+    jumps = np.diff(wall)[np.abs(np.diff(wall)) > 1000.0]
+    assert [round(jump / 3600.0) for jump in jumps] == [1, -2, 1], "the clock did not jump"
+    assert run.result["returncode"] == 0 and run.result["run"]["ended"] == "stop_requested"
+    ticks, period_ns = run.log.ticks, 1_000_000
+    assert (np.diff(ticks["t_ns"]) == ticks["gap"][1:] * period_ns).all(), "deadlines stay on their grid"
+    assert (np.diff(ticks["k"].astype(np.int64)) == ticks["gap"][1:]).all()
+    marks = json.loads((run.folder / "marks.json").read_text())
+    around = [ticks[np.abs(ticks["t_ns"] - mark) < 20 * period_ns] for mark in marks]
+    calm = [len(near) >= 39 and bool((near["rx_flags"] & int(RxFlag.FRESH)).all()) for near in around]
+    assert sum(calm) >= 2, "a stall of the machine may fall on one; what a step disturbs, each disturbs"
+    frames = np.array([frame.t_ns for frame in run.log.frames])
+    assert (np.diff(frames) >= 0).all() and frames[-1] - frames[0] < 4_000_000_000
+    assert replay_log(run.log).verdict == "same"
+
+
 def test_a_bus_without_a_partner_ends_the_run(socketcan: Path) -> None:
     run = seen(socketcan, "no_partner")
     assert run.result["returncode"] == 1

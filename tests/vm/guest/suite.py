@@ -292,6 +292,25 @@ BY_HAND = (
 )  # fmt: skip
 
 
+CLOCK_STEPS_S = (3600.0, -7200.0, 3600.0)
+
+
+def clock_steps() -> None:
+    """The wall clock jumps an hour on, two back, one on, as a time server may set it. Never a real host's."""
+    if "hil.bench_machine=1" not in Path("/proc/cmdline").read_text():
+        (OUT / "clock_steps.skipped").touch()
+        return
+    with Scenario("clock_steps", seconds=3.0) as s:
+        s.start()
+        s.running()
+        marks = []
+        for step_s in CLOCK_STEPS_S:
+            marks.append(time.monotonic_ns())
+            time.clock_settime(time.CLOCK_REALTIME, time.time() + step_s)
+            time.sleep(0.4)
+        (s.folder / "marks.json").write_text(json.dumps(marks))
+
+
 def by_hand() -> None:
     """The emulated drive driven with cansend alone, then left to its watchdog."""
     with Scenario("by_hand", plant=("firmware.watchdog_ms=1000.0",)):
@@ -317,6 +336,7 @@ def main() -> int:
         other_drive_watchdog,
         other_drive_is_late,
         by_hand,
+        clock_steps,
         controller_is_killed,
         interface_goes_down_and_up,
         drive_dies,
