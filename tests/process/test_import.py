@@ -74,6 +74,23 @@ def test_there_and_back_is_the_same_in_every_field(steady: Ran, tmp_path: Path, 
     assert [(f.received, f.can_id, f.data) for f in frames] == [(f.received, f.can_id, f.data) for f in again]
 
 
+@pytest.fixture(scope="module")
+def two_inputs(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """The paper's controller with a commanded load machine, on CAN FD."""
+    return ran(tmp_path_factory.mktemp("fac"), "paper.toml", "import-fac", "loop.duration_s=1.0")
+
+
+@pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
+def test_fac_on_can_fd_there_and_back(two_inputs: Ran, tmp_path: Path, ending: str) -> None:
+    recording, back = tmp_path / f"a{ending}", tmp_path / "back.mcap"
+    export(two_inputs.log, recording, frames=True)
+    found = import_recording(recording, back, two_inputs.config, two_inputs.settings)
+    assert found.commands == OURS and found.ended == "stop_requested" and found.damage is None
+    assert differing(two_inputs.log, back) == set()
+    assert max(len(frame.data) for frame in open_log(back).frames) > 8
+    assert replay(back).verdict == "same"
+
+
 @pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
 def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name: str) -> None:
     """Lateness, skipped periods and late feedback of a busy host included; with SYNC and without."""

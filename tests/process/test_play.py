@@ -11,6 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
+from hil.convert.export import export
+from hil.log.reader import open_log
 from tests.logfiles import some_ticks, write_log
 from tests.unit.test_play import bus_frames
 
@@ -34,3 +36,24 @@ def test_ctrl_c_ends_it_and_the_figures_are_printed(tmp_path: Path, channel: str
             process.kill()
     found = json.loads(out)
     assert process.returncode == 130 and found["interrupted"] and found["frames sent"] >= 1
+
+
+@pytest.mark.parametrize("ending", [".log", ".asc", ".blf"])
+def test_python_cans_player_plays_what_we_export(tmp_path: Path, channel: str, ending: str) -> None:
+    frames = bus_frames(60)
+    write_log(tmp_path / "run.mcap", some_ticks(60), frames)
+    recording = tmp_path / f"run{ending}"
+    export(tmp_path / "run.mcap", recording)
+    sent = [(f.can_id, f.data) for f in open_log(tmp_path / "run.mcap").frames]
+    with can.Bus(interface="hil-local", channel=channel) as bus:
+        words = ("-i", "hil-local", "-c", channel, "--ignore-timestamps", "-g", "0.002", str(recording))
+        player = subprocess.Popen([sys.executable, "-m", "can.player", *words], stdout=subprocess.DEVNULL)
+        try:
+            got = []
+            while len(got) < len(sent) and (message := bus.recv(30.0)) is not None:
+                got.append((message.arbitration_id, bytes(message.data)))
+            assert player.wait(30) == 0
+        finally:
+            player.kill()
+            player.wait()
+    assert got == sent
