@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import pty
+import re
 import select
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -125,6 +129,46 @@ def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:
             except OSError:  # the other end has gone
                 break
     return seen
+
+
+def resized(fd: int, columns: int, rows: int) -> list[str]:
+    """The lines of the first frame of that width after the terminal got that size, else of the last one."""
+    fcntl.ioctl(fd, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+    home, seen, end = b"\x1b[H", b"", time.monotonic() + 30
+    lines: list[str] = []
+    while time.monotonic() < end and max(map(len, lines), default=0) != columns:
+        if select.select([fd], [], [], 0.1)[0]:
+            seen += os.read(fd, 65536)
+        whole, _, rest = seen.rpartition(home)
+        if whole:
+            text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", whole.rpartition(home)[2].decode())
+            lines, seen = [line for line in re.split(r"[\r\n]+", text) if line], rest
+    return lines
+
+
+def test_the_terminal_is_resized(configs: Path, settings: Settings, channel: str) -> None:
+    own, path = settings("loop.duration_s=90.0"), configs / "demo.toml"
+    with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
+        wait_for_run(process, channel)
+        pid, fd = pty.fork()
+        if pid == 0:
+            env = {name: text for name, text in os.environ.items() if name not in ("COLUMNS", "LINES")}
+            os.execve(sys.executable, [sys.executable, "-m", "hil.cli", "watch", channel], env)
+        try:
+            assert b"q leaves" in read_until(fd, b"q leaves")
+            for columns, rows in ((100, 40), (50, 20), (20, 6), (160, 50)):
+                lines = resized(fd, columns, rows)
+                assert max(map(len, lines)) == columns, (columns, lines)
+                assert len(lines) <= rows, (rows, lines)
+            os.write(fd, b"q")
+            assert b"the run goes on" in read_until(fd, b"the run goes on")
+            assert os.waitpid(pid, 0)[1] == 0
+            pid = 0
+        finally:
+            if pid:
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+            os.close(fd)
 
 
 def test_keys_in_the_terminal_leave_and_stop(
