@@ -180,7 +180,7 @@ def test_frames_of_nobody_are_ridden_through(begin: Callable[[], Bench], bursts:
 @pytest.mark.parametrize(
     ("kinds", "bursts", "reasons"),
     [
-        ((damaged,), True, BROKEN_WORDS),
+        ((damaged,), False, BROKEN_WORDS),
         ((forged,), False, LIES),
         ((orders,), True, {Reason.FOREIGN_COMMAND}),
         ((errors,), True, {Reason.BUS_DOWN, Reason.CRC_ERRORS}),
