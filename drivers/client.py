@@ -35,7 +35,7 @@ from drivers.jit import entry
 from drivers.local import CLASSIC, ERR_FLAG, FD
 from drivers.mapping import DriveMap, house_map
 from drivers.port import COMPILED, SocketPort
-from drivers.posix import FLAGS, MORE, PENDING, REFUSED_COMMAND, SEEN, SIZE
+from drivers.posix import DRAIN_MOST, FLAGS, PENDING, REFUSED_COMMAND, SEEN, SIZE
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
@@ -46,7 +46,6 @@ BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
 STOP_REPEATS: Final = 5
 STOP_PAUSE_S: Final = 0.002
-DRAIN_MOST: Final = 256
 DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
@@ -65,6 +64,12 @@ class Outgoing:
         self.raw = laid_out(message.send_id, message.length, message.fd)
         self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
         self.encode: Send = lambda t_ns: -1
+
+
+def _offset(tick: Any, name: str) -> int:
+    """Where a field of a record is."""
+    at: int = tick.dtype.fields[name][1]
+    return at
 
 
 def precompile(database: Database, drive_map: DriveMap | None, load: bool, tick: Any) -> None:
@@ -117,7 +122,7 @@ class DriveClient:
         self._cells: Any = self._state.view("i8").data
         self._last = np.full(max(len(self.binding.incoming), 1), -1, np.int64)
         link, real = self._raw_link, self._now is time.monotonic_ns
-        shared = (self._state, self._words, self._log)
+        shared = {"state": self._state, "words": self._words, "log": self._log}
         self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
         self._drain_socket: Callable[[int, bool], int] | None = None
         self._latch: Callable[[int], int] | None = None
@@ -129,7 +134,7 @@ class DriveClient:
         values = np.array([*[0.0] * len(SOURCES), *constants])
         values[SOURCES.index("load_enable")] = 1.0
         self._values: Any = values.data
-        self._commanding = (values, messages, signals)
+        self._commanding = {"values": values, "messages": messages, "signals": signals}
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
         for out in self._outgoing:
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
@@ -141,7 +146,7 @@ class DriveClient:
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
             if self._port is not None:
-                self._latch = self._port.latcher(self._sync.raw, len(self._sync.view))
+                self._latch = self._port.latcher({"raw": self._sync.raw}, len(self._sync.view))
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -156,10 +161,12 @@ class DriveClient:
         self._error_cell = cell_of(tick, "drive_error")
         self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
         if self._port is not None:
-            self._drain_socket = self._port.drainer(args)
+            incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
+            self._drain_socket = self._port.drainer({"tick": raw, **incoming}, _offset(tick, "rx_flags"))
             if len(self._outgoing) == 1:
-                places = np.array([tick.dtype.fields[name][1] for name in _SENT_FIELDS])
-                self._command = self._port.commander(self._outgoing[0].raw, self._commanding, raw, places)
+                fields = np.array([_offset(tick, name) for name in _SENT_FIELDS], np.int64)
+                own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": fields}
+                self._command = self._port.commander(own | self._commanding)
         self._tick = tick
 
     @property
@@ -208,9 +215,13 @@ class DriveClient:
         """
         if tick is not self._tick:
             self.prepare(tick)
+        drain = self._drain_socket
+        code = 0 if drain is None else drain(deadline_ns, self._late)
+        if not (code or drain is None or self._pending_flags or self._down):
+            return
         flags, self._pending_flags = self._pending_flags, 0
         try:
-            flags |= self._drain(deadline_ns) if self._drain_socket is None else self._drain_port(deadline_ns)
+            flags |= self._drain(deadline_ns) if drain is None else self._go_on(code, drain, deadline_ns)
         except LinkDown:
             self._down = True
         except LinkError:
@@ -236,21 +247,24 @@ class DriveClient:
                 break
         return flags
 
-    def _drain_port(self, deadline_ns: int) -> int:
-        """:meth:`_drain` by the compiled kernel, which hands back what it can't judge."""
-        port, drain = self._port, self._drain_socket
-        assert port is not None and drain is not None  # noqa: S101 - made together
+    def _go_on(self, code: int, drain: Callable[[int, bool], int], deadline_ns: int) -> int:
+        """:meth:`_drain` from where the compiled kernel has handed back what it can't judge."""
+        port = self._port
+        assert port is not None  # noqa: S101 - made together with the kernel
         io = port.io
-        io[FLAGS], io[MORE] = 0, DRAIN_MOST
-        while code := drain(deadline_ns, self._late):
+        while code:
             if code < 0:
+                port.restart()
                 raise_link_error(OSError(-code, os.strerror(-code)), "receive")
             io[FLAGS] |= io[SEEN] if 0 <= io[SEEN] < STATE_RAW else self._finish(io[SEEN], io[SIZE])
             if self._cells[_LOGGED] >= ROOM - 1:
                 self.flush()
             if deadline_ns and io[FLAGS] & FRESH:
-                break
-        return int(io[FLAGS])
+                flags = int(io[FLAGS])
+                port.restart()
+                return flags
+            code = drain(deadline_ns, self._late)
+        return 0
 
     def _finish(self, seen: int, size: int) -> int:
         """Flags of a frame that the kernel leaves to be finished: one of no measurement, or a raw state."""

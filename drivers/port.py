@@ -11,39 +11,46 @@ from numba.core import config
 
 from drivers.bus import SocketLink
 from drivers.jit import entry
-from drivers.posix import MORE, command, drain, latch
+from drivers.posix import DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, latch, places_of
 
 COMPILED = not config.DISABLE_JIT  # type: ignore[attr-defined]
 """The kernels call the C library, which the interpreted form can't."""
+Arrays = dict[str, Any]
+"""What :data:`drivers.posix.ARRAYS` names."""
 
 
 class SocketPort:
-    """The kernels of one socket over their arrays. ``shared``: (state, words, log) of the client."""
+    """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
 
-    def __init__(self, link: SocketLink, shared: tuple[Any, Any, Any]) -> None:
-        self._fds = link.fds
-        self._state, self._words, self._log = shared
-        self._times = np.zeros(4, np.int64)
-        io = np.zeros(4, np.int64)
-        self._io, self.io = io, io.data
+    def __init__(self, link: SocketLink, shared: Arrays) -> None:
+        io = np.zeros(5, np.int64)
+        self.io: Any = io.data
+        self._shared: Arrays = {"fds": link.fds, "times": np.zeros(4, np.int64), "io": io, **shared}
+        self._alive: dict[Any, Arrays] = {}
 
-    def _over(self, kernel: Any, fixed: tuple[Any, ...], *free: Any) -> Callable[..., int]:
-        """The compiled form; the call that makes it has descriptors that lead nowhere."""
+    def _over(self, kernel: Any, own: Arrays, *known: Any, free: tuple[Any, ...]) -> Callable[..., int]:
+        """The compiled form; the call that makes it, with ``free``, has descriptors that lead nowhere."""
+        arrays = self._shared | own
+        self._alive[kernel] = arrays
         nowhere = np.full(4, -1, np.int32)
-        return partial(entry(kernel, nowhere, self._times, *fixed, *free), self._fds, self._times, *fixed)
+        compiled = entry(kernel, places_of(arrays | {"fds": nowhere}), *known, *free)
+        return partial(compiled, places_of(arrays), *known)
 
-    def drainer(self, taking: tuple[Any, ...]) -> Callable[[int, bool], int]:
-        """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes first."""
-        self._io[MORE] = 0
-        return self._over(drain, (self._io, *taking), 0, False)
+    def drainer(self, own: Arrays, flags_at: int) -> Callable[[int, bool], int]:
+        """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; the tick's flags' offset."""
+        self.io[FLAGS], self.io[MORE], self.io[FLAGS_AT] = 0, 0, flags_at
+        made = self._over(drain, own, free=(0, False))
+        self.restart()
+        return made
 
-    def latcher(self, raw: Any, size: int) -> Callable[[int], int]:
-        """:func:`drivers.posix.latch` for a SYNC that is laid out in ``raw``; its count is to be given."""
-        return self._over(latch, (raw, size, self._state, self._log), 0)
+    def restart(self) -> None:
+        """Let the next drain begin anew."""
+        self.io[FLAGS], self.io[MORE] = 0, DRAIN_MOST
 
-    def commander(
-        self, raw: Any, commanding: tuple[Any, Any, Any], tick: Any, places: Any
-    ) -> Callable[[], int]:
-        """:func:`drivers.posix.command` for one message, of (values, messages, signals) and a tick."""
-        shared = (self._state, self._words, self._log)
-        return self._over(command, (raw, *commanding, *shared, tick, places))
+    def latcher(self, own: Arrays, size: int) -> Callable[[int], int]:
+        """:func:`drivers.posix.latch` for a SYNC that is laid out; its count is to be given."""
+        return self._over(latch, own, size, free=(0,))
+
+    def commander(self, own: Arrays) -> Callable[[], int]:
+        """:func:`drivers.posix.command` for one message."""
+        return self._over(command, own, free=())

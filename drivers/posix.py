@@ -3,6 +3,10 @@
 :func:`drain` is the wait for a tick's feedback: ppoll to an absolute deadline with nanoseconds, one read a
 frame, each handed to :func:`drivers.wire.take`. What it can't judge itself it hands back to the caller, who
 calls again to go on. The symbols are the process's own (POSIX), so that the compiled form can be cached.
+
+To unpack an array of numpy's at every call costs more than what most kernels here do with it. The three that
+a tick calls take one array instead: the places (address and length) of all the others, as :func:`places_of`
+writes them down.
 """
 
 from __future__ import annotations
@@ -11,12 +15,15 @@ from typing import Any, Final
 
 import numba
 import numpy as np
+import numpy.typing as npt
 from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from drivers.frames import FRESH
 from drivers.jit import jit, waiting
 from drivers.states import ENABLE_OPERATION, FAULT_RESET
-from drivers.wire import DATA_AT, REFUSED, STATE_RAW, encode, note, take
+from drivers.wire import DATA_AT, FRAME, MESSAGE, REFUSED, SIGNAL, STATE, STATE_RAW, encode, note, take
 
 _types: Any = types
 carray: Any = numba.carray  # type: ignore[attr-defined]
@@ -37,7 +44,49 @@ DONE, HANDED_BACK, PENDING = range(3)
 REFUSED_COMMAND: Final = -1000
 """A value of the command fits no signal; other negative results are -errno."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE = range(4)
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT = range(5)
+DRAIN_MOST: Final = 256
+"""Frames that are still read once the time has passed; a flood can't exceed it."""
+
+ARRAYS: Final = {
+    "fds": np.dtype("i4"), "times": np.dtype("i8"), "io": np.dtype("i8"), "raw": np.dtype("u1"),
+    "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
+    "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
+}  # fmt: skip
+"""The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
+kernels here, the others of :mod:`drivers.wire`."""
+FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST, STATES, WORDS, TICK, LOG, FIELDS = range(13)
+I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
+
+
+def places_of(arrays: dict[str, Any]) -> npt.NDArray[np.int64]:
+    """Address and length of each array, 0 where there is none; they must outlive it. Raises TypeError."""
+    places = np.zeros((len(ARRAYS), 2), np.int64)
+    for index, (name, dtype) in enumerate(ARRAYS.items()):
+        if (array := arrays.get(name)) is None:
+            continue
+        if array.dtype != dtype or array.ndim != 1 or not array.flags.c_contiguous:
+            raise TypeError(f"{name}: {array.dtype} of shape {array.shape}; needs a plain row of {dtype}")
+        places[index] = array.ctypes.data, len(array)
+    return places
+
+
+def _to_pointer(_typing: Any, address: Any) -> Any:
+    """A pointer from its address."""
+
+    def made(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], cgutils.voidptr_t)
+
+    return _types.voidptr(address), made
+
+
+_behind: Any = intrinsic(_to_pointer)
+
+
+@jit
+def _array(places: Any, index: int, dtype: Any) -> Any:
+    """The array at a place."""
+    return carray(_behind(places[index, 0]), (places[index, 1],), dtype)
 
 
 @jit
@@ -63,15 +112,17 @@ def wait(fds: Any, times: Any, left_ns: int) -> Any:
 
 
 @waiting
-def drain(
-    fds: Any, times: Any, io: Any, raw: Any, messages: Any, signals: Any, last: Any, state: Any, words: Any,
-    tick: Any, log: Any, deadline_ns: int, late: bool,
-) -> Any:  # fmt: skip
+def drain(places: Any, deadline_ns: int, late: bool) -> Any:
     """Take frames until feedback came or the deadline passed; deadline 0: what is there.
 
-    ``io``: FLAGS of all taken, SEEN and SIZE of the frame that is handed back, and MORE, how many may still
-    be read once the time has passed. Returns DONE, HANDED_BACK or -errno.
+    ``IO``: FLAGS of all taken so far, SEEN and SIZE of the frame that is handed back, MORE, how many may
+    still be read once the time has passed. When it is done the flags are in the tick, at FLAGS_AT, and the
+    next call begins anew. Returns DONE, HANDED_BACK or -errno.
     """
+    fds, times, io = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, IO, I8)
+    raw, last, state = _array(places, RAW, U1), _array(places, LAST, I8), _array(places, STATES, STATE)
+    messages, signals = _array(places, MESSAGES, MESSAGE), _array(places, SIGNALS, SIGNAL)
+    words, tick, log = _array(places, WORDS, U4), _array(places, TICK, U1), _array(places, LOG, FRAME)
     while io[MORE] > 0:
         left_ns = max(deadline_ns - now_ns(times), 0) if deadline_ns > 0 else 0
         if left_ns > 0:
@@ -87,15 +138,26 @@ def drain(
             code = errno()
             if code == EINTR or (code == EAGAIN and left_ns > 0):
                 continue
-            return DONE if code == EAGAIN else -code
+            if code != EAGAIN:
+                return -code
+            break
         seen = take(raw, messages, signals, last, state, words, tick, log, size, late, now_ns(times))
         if seen < 0 or seen >= STATE_RAW or state[0]["logged"] >= len(log) - 1 > 0:
             io[SEEN], io[SIZE] = seen, size
             return HANDED_BACK
         io[FLAGS] |= seen
         if deadline_ns > 0 and seen & FRESH:
-            return DONE
+            break
+    finish(io, tick)
     return DONE
+
+
+@jit
+def finish(io: Any, tick: Any) -> None:
+    """Put the flags of all taken into the tick, and begin anew."""
+    at = io[FLAGS_AT]
+    tick[at : at + 4].view(np.uint32)[0] |= np.uint32(io[FLAGS])
+    io[FLAGS], io[MORE] = 0, DRAIN_MOST
 
 
 @jit
@@ -111,8 +173,10 @@ def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
 
 
 @jit
-def latch(fds: Any, times: Any, raw: Any, size: int, state: Any, log: Any, count: int) -> Any:
+def latch(places: Any, size: int, count: int) -> Any:
     """Send SYNC with its count, unless frames wait to be taken as late ones. PENDING, DONE or -errno."""
+    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, RAW, U1)
+    state, log = _array(places, STATES, STATE), _array(places, LOG, FRAME)
     if wait(fds, times, 0) != 0:
         return PENDING
     if raw[4] > 0:
@@ -122,13 +186,13 @@ def latch(fds: Any, times: Any, raw: Any, size: int, state: Any, log: Any, count
 
 
 @jit
-def gather(values: Any, tick: Any, places: Any) -> None:
-    """Values of a tick's command: counter, controlword, u_q, u_d, T_L from their ``places`` in the tick."""
+def gather(values: Any, tick: Any, fields: Any) -> None:
+    """Values of a tick's command: counter, controlword, u_q, u_d, T_L from their ``fields``' offsets."""
     for index in range(2):
-        at = places[index]
+        at = fields[index]
         values[index] = float(tick[at : at + 4].view(np.uint32)[0])
     for index in range(2, 5):
-        at = places[index]
+        at = fields[index]
         values[index] = tick[at : at + 8].view(np.float64)[0]
     word = int(values[1])
     values[5] = 1.0 if word == ENABLE_OPERATION else 0.0
@@ -136,12 +200,14 @@ def gather(values: Any, tick: Any, places: Any) -> None:
 
 
 @jit
-def command(
-    fds: Any, times: Any, raw: Any, values: Any, messages: Any, signals: Any,
-    state: Any, words: Any, log: Any, tick: Any, places: Any,
-) -> Any:  # fmt: skip
+def command(places: Any) -> Any:
     """Lay out and send a tick's command of one message. Returns DONE, REFUSED_COMMAND or -errno."""
-    gather(values, tick, places)
+    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, RAW, U1)
+    values, tick, fields = _array(places, VALUES, F8), _array(places, TICK, U1), _array(places, FIELDS, I8)
+    messages, signals = _array(places, MESSAGES, MESSAGE), _array(places, SIGNALS, SIGNAL)
+    state, words = _array(places, STATES, STATE), _array(places, WORDS, U4)
+    log = _array(places, LOG, FRAME)
+    gather(values, tick, fields)
     size = encode(raw, values, 0, messages, signals, state, words, log, now_ns(times))
     if size == REFUSED:
         return REFUSED_COMMAND

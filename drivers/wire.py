@@ -8,6 +8,7 @@ The rules are those of :mod:`drivers.signal` and :mod:`drivers.e2e`; equality wi
 
 from __future__ import annotations
 
+from binascii import crc_hqx
 from typing import Any, Final
 
 import numpy as np
@@ -69,16 +70,14 @@ FRAME: Final = np.dtype(
 )
 """A frame as it is logged."""
 
+_CRC16: Final = np.array([crc_hqx(bytes((byte,)), 0) for byte in range(256)])
 _CRC8: Final = np.frombuffer(CRC8_TABLE, np.uint8).astype(np.int64)
 
 
 @jit
 def crc_16(crc: int, byte: int) -> int:
     """One byte of CRC-16 with polynomial 0x1021."""
-    crc ^= byte << 8
-    for _ in range(8):
-        crc = ((crc << 1) ^ 0x1021) & 0xFFFF if crc & 0x8000 else (crc << 1) & 0xFFFF
-    return crc
+    return int((crc << 8) & 0xFFFF ^ _CRC16[(crc >> 8) ^ byte])
 
 
 @jit

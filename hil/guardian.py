@@ -29,7 +29,7 @@ from hil.ports import Drive
 from hil.signals import DriveState, RxFlag, cell
 
 GUARDIAN_LOST_NS = 500_000_000
-"""Age of the guardian's own heartbeat at which the controller stops the run."""
+"""Age of the guardian's own heartbeat, at the controller's newest, at which the controller stops the run."""
 START_S = 5.0
 STOPS = 3
 """How often the drive client's sequence of stop frames is sent when the guardian fires."""
@@ -91,7 +91,7 @@ class GuardedDrive:
         words = self._words
         if words[FIRED]:
             self._flags[0] |= GUARDIAN
-        elif self._now() - words[GUARD_NS] > GUARDIAN_LOST_NS:
+        elif words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS:
             self._flags[0] |= GUARDIAN_LOST
 
     def send(self, tick: Any) -> None:

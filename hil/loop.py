@@ -122,17 +122,20 @@ class Loop:
 
     def _run(self) -> None:
         tick: Any = self._ticks[0]
-        clock, plan, outcome = self._clock, self._plan, self._outcome
+        clock, plan, outcome, t = self._clock, self._plan, self._outcome, self._cells
         self._drive.prepare(tick)
         start_ns = clock.now_ns()
         k = 0
         while True:
             deadline_ns = start_ns + k * plan.period_ns
             now_ns = clock.sleep_until(deadline_ns) if plan.pacing != "feedback" else clock.now_ns()
-            k, gap = self._skip(k, deadline_ns, now_ns)
-            k = self._one(tick, k, start_ns + k * plan.period_ns, gap, now_ns)
+            gap = 1
+            if now_ns - deadline_ns >= plan.period_ns:
+                k, gap = self._skip(k, deadline_ns, now_ns)
+                deadline_ns = start_ns + k * plan.period_ns
+            k = self._one(tick, k, deadline_ns, gap, now_ns)
             outcome.ticks += 1
-            if self._ended():
+            if t.reason[0] and self._ended():
                 return
             k += 1
 
@@ -141,8 +144,6 @@ class Loop:
         if self._plan.pacing == "feedback" or k == 0:
             return k, 1
         skipped = (now_ns - deadline_ns) // self._plan.period_ns
-        if skipped <= 0:
-            return k, 1
         self._outcome.skipped += skipped
         return k + skipped, 1 + skipped
 
@@ -157,21 +158,25 @@ class Loop:
             self._drive.receive(tick, 0)
         else:
             k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
-        t.received_ns[0] = bounded(now() - deadline_ns)
+        ns = now() - deadline_ns
+        t.received_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
         if self._plan.pacing == "timer":
             self._note_age(deadline_ns)
         self._step(self._ticks)
-        t.computed_ns[0] = bounded(now() - deadline_ns)
+        ns = now() - deadline_ns
+        t.computed_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
         if t.send[0]:
             self._send(tick)
-        t.sent_ns[0] = bounded(now() - deadline_ns)
+        ns = now() - deadline_ns
+        t.sent_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
         if t.rx_flags[0] & TROUBLE:
             self._trouble.note(deadline_ns, k, t.rx_flags[0])
         if t.state[0] != self._state:
             self._state = t.state[0]
             self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))
         self._recorder.tick(self._ticks)
-        t.recorded_ns[0] = bounded(now() - deadline_ns)
+        ns = now() - deadline_ns
+        t.recorded_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
         return k
 
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:

@@ -244,7 +244,7 @@ def test_it_is_armed_in_every_state_but_the_first(state: DriveState) -> None:
 )
 def test_what_the_guardian_did_is_flagged(fired: int, age: int, flags: int) -> None:
     g = Guarded(fired=fired)
-    g.cells[Word.GUARD_NS], g.now_ns = 1_000, 1_000 + age
+    g.cells[Word.GUARD_NS], g.cells[Word.BEAT_NS] = 1_000, 1_000 + age
     g.tick["rx_flags"] = FRESH
     g.drive.receive(g.tick, 0)
     assert int(g.tick["rx_flags"]) == flags

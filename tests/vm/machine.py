@@ -199,7 +199,7 @@ def run_in_machine(script: str, *, timeout_s: float = TIMEOUT_S, out: Path | Non
         "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot",
         "-m", "2048", "-smp", "1", "-cpu", "max", "-accel", "tcg", "-icount", "shift=0,sleep=off",
         "-kernel", str(kernel), "-initrd", str(initramfs),
-        "-append", "console=ttyS0 quiet panic=-1 mitigations=off hil.bench_machine=1",
+        "-append", "console=ttyS0 quiet panic=-1 mitigations=off preempt=full hil.bench_machine=1",
         "-serial", f"file:{folder / 'serial.log'}",
         "-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap",
         "-virtfs", f"local,path={folder},mount_tag=out,security_model=none",

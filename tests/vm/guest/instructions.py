@@ -19,7 +19,7 @@ from hil import cli
 from hil.bench.meter import run_metered
 from hil.bench.pieces import guard_ns
 from hil.config import RunConfig, load_toml
-from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked
+from tests.vm.guest.process import CONFIG, FD, SCRATCH, Forked
 
 SECONDS = 0.5
 ATTEMPTS = 3
@@ -61,7 +61,7 @@ class Bus:
         self.emulator = Forked.hil(self.folder / "emulator.txt", *words)
 
     def words(self, interface: str) -> list[str]:
-        return ["-i", "socketcan", "-c", interface, *flags("--set", *PATIENT, *self.settings)]
+        return ["-i", "socketcan", "-c", interface, *flags("--set", *self.settings)]
 
     def run_words(self) -> list[str]:
         arm = [] if self.own.startswith("vcan") else ["--arm", "--yes"]

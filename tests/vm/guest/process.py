@@ -16,8 +16,6 @@ from hil.emulate import make_node
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
 FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
-# one processor serves every process of the machine: something stalls all of them for up to 30 ms now and then
-PATIENT = ("guardian.timeout_ms=200.0", "loop.max_gap_ticks=64")
 
 
 class Forked:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tests.vm.guest import instructions as counted
-from tests.vm.guest.process import CONFIG, FD, PATIENT, SCRATCH, Forked, warm_up
+from tests.vm.guest.process import CONFIG, FD, SCRATCH, Forked, warm_up
 
 OUT = Path(os.environ["OUT"])
 
@@ -57,7 +57,7 @@ class Scenario:
         return self
 
     def _bus(self, channel: str) -> list[str]:
-        own = [word for one in (*PATIENT, *self.settings) for word in ("--set", one)]
+        own = [word for one in self.settings for word in ("--set", one)]
         return ["-i", "socketcan", "-c", channel, *own]
 
     def start(self) -> None:
