@@ -363,14 +363,20 @@ def needed_bytes(config: RunConfig) -> int:
     return round(seconds * config.loop.rate_hz * BYTES_PER_TICK) + (8 << 20)
 
 
+def compile_kernels(setup: Setup) -> None:
+    """Compile, or load, what a run needs: that takes longer than anything later waits for."""
+    setup.machine.looped()
+    fac = setup.config.controller.kind == "fac"
+    precompile(setup.database, setup.binding.map, fac, new_ticks()[0])
+
+
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
     """Arm and run a configuration; returns after a safe stop. Raises HilError before anything is sent."""
     check_arming(setup, arm)
     check_load(setup)
     request = request or StopRequest()
     config = setup.config
-    setup.machine.warm_up()  # compiling takes longer than anything later waits for
-    precompile(setup.database, setup.binding.map, config.controller.kind == "fac", new_ticks()[0])
+    compile_kernels(setup)
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
