@@ -12,6 +12,20 @@ import pytest
 from tests.vm.machine import ROOT, MachineError, run_in_machine
 
 REQUIRED = os.environ.get("HIL_REQUIRE_VM") == "1"
+FIGURES: list[str] = []
+
+
+@pytest.fixture(scope="session")
+def figures() -> list[str]:
+    """What a test puts here is shown at the end, also when all is well."""
+    return FIGURES
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Show the figures of the runs on SocketCAN."""
+    if FIGURES:
+        terminalreporter.section("SocketCAN")
+        terminalreporter.write_line("\n".join(FIGURES))
 
 
 def host_has_can() -> bool:

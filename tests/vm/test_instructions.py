@@ -29,9 +29,9 @@ def of_bus(counted: dict[str, Any], name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", BUSES)
-def test_a_tick_is_within_its_budget(counted: dict[str, Any], name: str) -> None:
+def test_a_tick_is_within_its_budget(counted: dict[str, Any], name: str, figures: list[str]) -> None:
     bus = of_bus(counted, name)
-    print(f"\n{name}\n{table_of(bus, budget()[name])}")
+    figures.append(f"{name}: instructions a tick\n{table_of(bus, budget()[name])}")
     assert not (over := excess(name, bus)), over
 
 

@@ -48,7 +48,7 @@ def frames_of(path: Path) -> list[tuple[int, bytes]]:
     return [(can_id, data) for _, can_id, data in timed_frames_of(path)]
 
 
-def steady(run: Seen, name: str) -> None:
+def steady(run: Seen, name: str, figures: list[str]) -> None:
     """The run went to its end, replays to the bit, and says what it cost."""
     assert run.result["returncode"] == 0, run.result
     result = run.result["run"]
@@ -58,7 +58,7 @@ def steady(run: Seen, name: str) -> None:
     late_us = run.log.ticks["lateness_ns"] * 1e-3
     p50, p99 = np.percentile(late_us, [50, 99])
     seconds = (run.log.ticks["t_ns"][-1] - run.log.ticks["t_ns"][0]) * 1e-9
-    print(
+    figures.append(
         f"{name}: {result['ticks']} ticks, {result['skipped']} skipped, "
         f"{len(run.frames) / seconds:.0f} frames/s, "
         f"loop {result['processor_us'] * 1e3:.0f} instructions a tick in virtual time, "
@@ -95,22 +95,22 @@ def assert_nothing_after_the_stop(run: Seen) -> None:
 
 
 @pytest.mark.parametrize("name", ["vcan_two_processes", "kvaser_pair"])
-def test_a_run_between_two_processes(socketcan: Path, name: str) -> None:
-    steady(seen(socketcan, name), name)
+def test_a_run_between_two_processes(socketcan: Path, name: str, figures: list[str]) -> None:
+    steady(seen(socketcan, name), name, figures)
 
 
-def test_64_byte_frames_on_vcan(socketcan: Path) -> None:
+def test_64_byte_frames_on_vcan(socketcan: Path, figures: list[str]) -> None:
     run = seen(socketcan, "vcan_fd")
-    steady(run, "vcan_fd")
+    steady(run, "vcan_fd", figures)
     fd = Database(CONFIGS / "drives" / "hil_pmsm_fd.dbc")
     by_id = {message.can_id: message for message in fd.messages.values()}
     assert {len(data) for can_id, data in run.frames if can_id in (0x181, 0x201)} == {64}
     assert all(by_id[can_id].valid(data) for can_id, data in run.frames)
 
 
-def test_another_makers_drive_by_configuration_alone(socketcan: Path) -> None:
+def test_another_makers_drive_by_configuration_alone(socketcan: Path, figures: list[str]) -> None:
     run = seen(socketcan, "vcan_other_drive")
-    steady(run, "vcan_other_drive")
+    steady(run, "vcan_other_drive", figures)
     assert {can_id for can_id, _ in run.frames} == {0x18FF1000, 0x18FF1002, 0x18FF10F0, 0x18FF1100}
     own = run.log.ticks[run.log.ticks["state"] == DriveState.OPERATION_ENABLED]
     assert len(own) > 1500 and np.abs(own["w"] - own["w_ref"])[-200:].max() < 5.0
