@@ -312,3 +312,13 @@ def test_a_bus_without_a_partner_ends_the_run(socketcan: Path) -> None:
     # the emulated wire acknowledges even without a partner, so the card stays error-active and the drive's
     # silence ends the run; on a real wire the queue fills first, which queue_is_full makes
     assert link["linkinfo"]["info_data"]["state"] in ("ERROR-ACTIVE", "ERROR-WARNING", "ERROR-PASSIVE")
+
+
+def test_canplayer_plays_what_was_exported(socketcan: Path) -> None:
+    exported, played = (
+        timed_frames_of(socketcan / "canplayer" / f"{name}.log") for name in ("exported", "played")
+    )
+    assert len(exported) > 1500
+    assert [frame[1:] for frame in played] == [frame[1:] for frame in exported]
+    lasted, took = (frames[-1][0] - frames[0][0] for frames in (exported, played))
+    assert took == pytest.approx(lasted, rel=0.05), "with the timing of the log"

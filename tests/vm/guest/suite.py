@@ -322,6 +322,22 @@ def by_hand() -> None:
         time.sleep(0.05)
 
 
+def canplayer() -> None:
+    """can-utils' canplayer plays on vcan0 what `hil export` wrote of an earlier run."""
+    folder = SCRATCH / "canplayer"
+    folder.mkdir()
+    log, exported = next((SCRATCH / "rehearsal").glob("*.mcap")), folder / "exported.log"
+    Forked.hil(folder / "export.txt", "export", str(log), "-o", str(exported)).wait()
+    with (folder / "played.log").open("w") as heard:
+        dump = subprocess.Popen(["candump", "-L", "vcan0"], stdout=heard)
+        time.sleep(0.1)
+        sh("canplayer", "-I", str(exported))
+        time.sleep(0.1)
+        dump.terminate()
+        dump.wait()
+    shutil.copytree(folder, OUT / folder.name)
+
+
 def instructions() -> None:
     """What a tick costs, phase by phase."""
     counted.measure(OUT)
@@ -350,6 +366,7 @@ def main() -> int:
         bus_off_is_reported,
         queue_is_full,
         no_partner,
+        canplayer,
         instructions,
     ]
     wanted = sys.argv[1:]
