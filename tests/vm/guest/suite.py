@@ -331,7 +331,7 @@ def canplayer() -> None:
     with (folder / "played.log").open("w") as heard:
         dump = subprocess.Popen(["candump", "-L", "vcan0"], stdout=heard)
         time.sleep(0.1)
-        sh("canplayer", "-I", str(exported))
+        sh("canplayer", "-I", str(exported), "vcan0=can0")  # an export calls its bus can0
         time.sleep(0.1)
         dump.terminate()
         dump.wait()
