@@ -62,14 +62,20 @@ def differing(log: Path, other: Path) -> set[str]:
     return {field.name for field in FIELDS if a[field.name].tobytes() != b[field.name].tobytes()}
 
 
+def there_and_back(one: Ran, folder: Path, ending: str) -> Path:
+    """The log of a recording of the run, the same in every field."""
+    recording, back = folder / f"a{ending}", folder / "back.mcap"
+    export(one.log, recording, frames=True)
+    found = import_recording(recording, back, one.config, one.settings)
+    assert found.commands == OURS and found.ended == "stop_requested" and found.damage is None
+    assert differing(one.log, back) == set()
+    assert replay(back).verdict == "same"
+    return back
+
+
 @pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
 def test_there_and_back_is_the_same_in_every_field(steady: Ran, tmp_path: Path, ending: str) -> None:
-    recording, back = tmp_path / f"a{ending}", tmp_path / "back.mcap"
-    export(steady.log, recording, frames=True)
-    found = import_recording(recording, back, steady.config, steady.settings)
-    assert found.commands == OURS and found.ended == "stop_requested" and found.damage is None
-    assert differing(steady.log, back) == set()
-    assert replay(back).verdict == "same"
+    back = there_and_back(steady, tmp_path, ending)
     frames, again = open_log(steady.log).frames, open_log(back).frames
     assert [(f.received, f.can_id, f.data) for f in frames] == [(f.received, f.can_id, f.data) for f in again]
 
@@ -82,13 +88,8 @@ def two_inputs(tmp_path_factory: pytest.TempPathFactory) -> Ran:
 
 @pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
 def test_fac_on_can_fd_there_and_back(two_inputs: Ran, tmp_path: Path, ending: str) -> None:
-    recording, back = tmp_path / f"a{ending}", tmp_path / "back.mcap"
-    export(two_inputs.log, recording, frames=True)
-    found = import_recording(recording, back, two_inputs.config, two_inputs.settings)
-    assert found.commands == OURS and found.ended == "stop_requested" and found.damage is None
-    assert differing(two_inputs.log, back) == set()
+    back = there_and_back(two_inputs, tmp_path, ending)
     assert max(len(frame.data) for frame in open_log(back).frames) > 8
-    assert replay(back).verdict == "same"
 
 
 @pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
