@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from hil.convert.export import FORMATS, MAT
+from hil.convert.export import FORMATS
 from hil.demo import find_config
 from hil.log.mcapfile import RunFile
 from hil.log.reader import new_log, read_blocks
@@ -104,8 +104,8 @@ def costs(folder: Path, endings: list[str]) -> Iterator[Cost]:
             yield cost(log, "replay", str(log))
             out = folder / f"{log.stem}.html"
             yield cost(out, "report", str(log), "-o", str(out))
-    for ending in endings or [*FORMATS, MAT]:
-        for log in (plain, full) if ending == MAT or FORMATS[ending][0] == "ticks" else (full,):
+    for ending in endings or FORMATS:
+        for log in (plain, full) if FORMATS[ending][0] == "ticks" else (full,):
             out = folder / f"{log.stem}{ending}"
             yield cost(out, "export", str(log), "-o", str(out))
             out.unlink()

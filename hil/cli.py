@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 
 from hil.commands import bench, convert, demo, emulated, faults, log, paper, play, replay, report, run, watch
@@ -28,8 +27,6 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil faults [CONFIG]          every fault against the running loop, with a verdict on each
   hil paper                    everything the paper prints and draws, recomputed
 """
-PRIVATE = 0o077
-"""The umask of every command: logs, compiled kernels, lists of runs and exports are this user's alone."""
 MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench, faults)
 
 
@@ -46,7 +43,6 @@ def _parser() -> argparse.ArgumentParser:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; every refusal is one clear line on standard error and exit code 2."""
     args = _parser().parse_args(argv)
-    os.umask(PRIVATE)
     try:
         return int(args.run(args))
     except KeyboardInterrupt:

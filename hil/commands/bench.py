@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, bus_flags, overrides, print_json, say
+from hil.commands.common import Commands, bus_flags, output_folder, overrides, print_json, say
 
 
 def register(commands: Commands) -> None:
@@ -33,12 +33,13 @@ def cmd_bench(args: argparse.Namespace) -> int:
     from hil.view import key_values, show
 
     earlier = read_result(args.compare) if args.compare else None
+    out = output_folder(args.output) if args.output else None
     path = args.config or find_config("demo.toml")
     done = bench(path, overrides(args), QUICK if args.quick else FULL, say)
     result = done.result
     if earlier is not None:
         result["compared"] = ratios(result, earlier)
-    written = write(done, args.output) if args.output else []
+    written = write(done, out) if out else []
     if args.json:
         print_json(result)
         return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -70,6 +71,32 @@ def one_run(paths: Sequence[Path]) -> tuple[Path, ...]:
         names = ", ".join(run[0].name for run in runs)
         raise HilError(f"{names} are no parts of one run; this command takes one run at a time")
     return runs[0]
+
+
+def output_file(path: Path) -> Path:
+    """A file to be written in the end, refused before the work when it can't be. Raises HilError."""
+    from hil.errors import HilError
+
+    if path.is_dir():
+        raise HilError(f"{path}: is a folder; name another file")
+    if not path.parent.is_dir():
+        raise HilError(f"{path.parent}: no such folder; make it, or name another file")
+    if not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise HilError(f"{path}: can't be written; name another file")
+    return path
+
+
+def output_folder(path: Path) -> Path:
+    """A folder for results, made with the rights that this user gives new ones. Raises HilError."""
+    from hil.errors import HilError
+
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise HilError(f"{path}: can't be made: {error.strerror}; name another folder") from error
+    if not os.access(path, os.W_OK):
+        raise HilError(f"{path}: can't be written into; name another folder")
+    return path
 
 
 def print_json(value: Any) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, print_json, say
+from hil.commands.common import EXIT_FAILED, Commands, output_file, print_json, say
 
 
 def register(commands: Commands) -> None:
@@ -38,6 +38,7 @@ def cmd_faults(args: argparse.Namespace) -> int:
     from hil.faults.view import closing, table
     from hil.view import show
 
+    html = output_file(args.html) if args.html else None
     shipped = find_config("faults.toml")
     matrix, path = load_matrix(args.config or shipped, shipped)
     folder = args.folder.resolve() / datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
@@ -45,8 +46,8 @@ def cmd_faults(args: argparse.Namespace) -> int:
     say(f"faults: {len(rows)} runs; logs in {folder}")
     jobs = max(1, args.jobs)
     results = study(path, matrix, rows, folder, jobs, lambda r: say(f"  {r.fault}: {r.verdict}"))
-    if args.html:
-        args.html.write_text(page(results), encoding="utf-8")
+    if html:
+        html.write_text(page(results), encoding="utf-8")
     if args.json:
         good = sum(r.verdict == AS_EXPECTED for r in results)
         print_json({"rows": [r.as_dict() for r in results], "as_expected": good, "of": len(results)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, say
+from hil.commands.common import Commands, output_folder, say
 
 
 def register(commands: Commands) -> None:
@@ -25,10 +25,11 @@ def cmd_paper(args: argparse.Namespace) -> int:
     from hil.paper import run
     from hil.view import show
 
+    out = output_folder(args.output)
     say("paper: the corrected design on the bench over the bus (lockstep), then every figure; under a minute")
-    settings = ('loop.clock="lockstep"', f'log.folder="{args.output.resolve()}"')
+    settings = ('loop.clock="lockstep"', f'log.folder="{out.resolve()}"')
     _, _, log = closed_loop(find_config("paper.toml"), Overrides(settings=settings))
-    result = run(args.output, log.ticks)
+    result = run(out, log.ticks)
     if args.json:
         print(result.to_json())  # noqa: T201
     else:

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, one_run, print_json, say
+from hil.commands.common import Commands, one_run, output_file, print_json, say
 
 if TYPE_CHECKING:
     from hil.replay import Verdict, Window
@@ -53,6 +53,8 @@ def cmd_replay(args: argparse.Namespace) -> int:
         raise HilError("-o needs --config; a replay itself writes nothing")
     if not 0 <= args.start < end:
         raise HilError(f"--from {args.start:g} --to {end:g}: no such window")
+    if args.junit:
+        output_file(args.junit)
     results = [_timed(paths, Window(args.start, end)) for paths in grouped(args.logs)]
     _report(args, results)
     return max(verdict.exit_code for _, verdict, _ in results)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import can
 import numpy as np
 
 from hil.convert.recordings import Candump, Mf4Recording, Vector
-from hil.convert.tables import CsvTable, Mf4Table, ParquetTable, write_mat
+from hil.convert.tables import CsvTable, MatTable, Mf4Table, ParquetTable
 from hil.log.errors import LogError
 from hil.log.reader import Log, Source, new_log, read_blocks
 from hil.log.schema import Records
@@ -27,8 +28,8 @@ class Sink(Protocol):
     def add(self, records: Records, /) -> None:
         """Append ticks or frames."""
 
-    def close(self) -> None:
-        """Finish the file."""
+    def close(self, *, whole: bool) -> None:
+        """Finish the file; one that is not whole goes, so it need only be let go of."""
 
 
 Open = Callable[[Path, Log], Sink]
@@ -37,12 +38,12 @@ FRAMES_OF: Final[dict[str, Open]] = {".mf4": Mf4Recording}
 FORMATS: Final[dict[str, tuple[Literal["ticks", "frames"], Open]]] = {
     ".parquet": ("ticks", ParquetTable),
     ".csv": ("ticks", CsvTable),
+    ".mat": ("ticks", MatTable),
     ".mf4": ("ticks", Mf4Table),
     ".log": ("frames", lambda path, log: Candump(path, log, "can0")),
     ".asc": ("frames", lambda path, log: Vector(can.ASCWriter(path), log)),
     ".blf": ("frames", lambda path, log: Vector(can.BLFWriter(path), log)),
 }
-MAT: Final = ".mat"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,7 @@ def replacing(out: Path, *, force: bool) -> Iterator[Path]:
         raise LogError(f"{out}: exists already; --force replaces it")
     part = out.with_name(f".{out.name}.part{out.suffix}")
     try:
+        part.unlink(missing_ok=True)  # of one that was killed
         yield part
         part.replace(out)
     except LogError:
@@ -86,34 +88,31 @@ def export(source: Source, out: Path, *, frames: bool = False, force: bool = Fal
     ``frames``: the frames, where the ending can stand for them and for ticks.
     """
     kind = out.suffix.lower()
-    if kind not in FORMATS and kind != MAT:
-        raise LogError(f"{out}: the ending must be one of {' '.join(sorted([*FORMATS, MAT]))}")
-    if frames and kind not in FRAMES_OF and (kind == MAT or FORMATS[kind][0] != "frames"):
+    if kind not in FORMATS:
+        raise LogError(f"{out}: the ending must be one of {' '.join(sorted(FORMATS))}")
+    holds, opened = ("frames", FRAMES_OF[kind]) if frames and kind in FRAMES_OF else FORMATS[kind]
+    if frames and holds != "frames":
         raise LogError(f"{out}: {kind} holds ticks; frames go to .log .asc .blf .mf4")
     log = new_log(source)
     with replacing(out, force=force) as part:
-        if kind == MAT:
-            log = write_mat(part, source)
-            holds, count = "ticks", len(log.ticks)
-        else:
-            holds, opened = ("frames", FRAMES_OF[kind]) if frames and kind in FRAMES_OF else FORMATS[kind]
-            count = _stream(log, part, holds, opened)
+        count = _stream(log, part, holds, opened)
     return Exported(str(out), holds, count, out.stat().st_size, log.damage)
 
 
 def _stream(log: Log, part: Path, holds: str, opened: Open) -> int:
     """Slabs of the log into a sink. The sink is opened with the first, when the metadata are known."""
-    sink, count = None, 0
+    slabs = _slabs(log, holds)
+    first = next(slabs, None)
+    if first is None:
+        raise LogError(f"{log.path}: holds no {holds}")
+    sink, count, whole = opened(part, log), 0, False
     try:
-        for slab in _slabs(log, holds):
-            sink = sink or opened(part, log)
+        for slab in itertools.chain([first], slabs):
             sink.add(slab)
             count += len(slab)
-        if sink is None:
-            raise LogError(f"{log.path}: holds no {holds}")
+        whole = True
     finally:
-        if sink is not None:
-            sink.close()
+        sink.close(whole=whole)
     return count
 
 

@@ -66,7 +66,7 @@ class Candump(_Recording):
             lines.append(f"{stamp} {channel} {body} {way}\n")
         self._file.write("".join(lines))
 
-    def close(self) -> None:
+    def close(self, *, whole: bool) -> None:
         """Flush and close."""
         self._file.close()
 
@@ -96,7 +96,7 @@ class Vector(_Recording):
                 )
             )
 
-    def close(self) -> None:
+    def close(self, *, whole: bool) -> None:
         """Finish the file."""
         self._writer.stop()
 
@@ -145,10 +145,11 @@ class Mf4Recording(_Recording):
                 seconds = (own["t_ns"] - first_ns) // 1000 * 1e-6
                 self._file.extend(index, [(seconds, None), (_group_rows(group, own), None)])
 
-    def close(self) -> None:
-        """Write the file."""
+    def close(self, *, whole: bool) -> None:
+        """Write the file, when it is whole; let go of the temporary one."""
         try:
-            self._file.save(self._path, overwrite=True)
+            if whole:
+                self._file.save(self._path, overwrite=True)
         finally:
             self._file.close()
 

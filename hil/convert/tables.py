@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Final
 
 import numpy as np
 
 from hil.convert.frame import need, title
 from hil.log.errors import LogError
-from hil.log.reader import Log, Source, open_log
+from hil.log.reader import Log
 from hil.signals import FIELDS, TickArray
+
+MAT_TICKS: Final = 2**28 - 2**10
+"""A variable of MATLAB 5 is below 2^31 bytes: 74 hours at 1 kHz."""
 
 
 def _columns(ticks: TickArray) -> list[Any]:
@@ -37,7 +41,7 @@ class ParquetTable:
         arrays = [self._pa.array(column) for column in _columns(ticks)]
         self._writer.write_batch(self._pa.record_batch(arrays, schema=self._schema))
 
-    def close(self) -> None:
+    def close(self, *, whole: bool) -> None:
         """Write the footer."""
         self._writer.close()
 
@@ -58,7 +62,7 @@ class CsvTable:
         """Append ticks as lines."""
         self._writer.write_batch(self._batch(ticks))
 
-    def close(self) -> None:
+    def close(self, *, whole: bool) -> None:
         """Flush and close."""
         self._writer.close()
 
@@ -85,26 +89,59 @@ class Mf4Table:
         else:
             self._file.extend(0, [((t - self._first) * 1e-9, None), *((column, None) for column in columns)])
 
-    def close(self) -> None:
-        """Write the file."""
+    def close(self, *, whole: bool) -> None:
+        """Write the file, when it is whole; let go of the temporary one."""
         try:
-            self._file.save(self._path, overwrite=True)
+            if whole:
+                self._file.save(self._path, overwrite=True)
         finally:
             self._file.close()
 
 
-def write_mat(path: Path, source: Source) -> Log:
-    """MATLAB 5 file: a vector a field, structs ``units``, ``meanings`` and ``run``.
+class MatTable:
+    """MATLAB 5 file: a compressed vector a field, structs ``units``, ``meanings`` and ``run``.
 
-    Holds all ticks in memory; raises LogError when they do not fit into half of it, and when there are none.
+    The format wants a variable whole behind its length, so each column waits in a nameless file in the folder
+    of the target, which the system removes with this process, however it ends. Memory holds one column.
     """
-    savemat = need("scipy.io", "MAT").savemat
-    log = open_log(source, frames=False)
-    if not len(log.ticks):
-        raise LogError(f"{log.path}: holds no ticks")
-    columns: dict[str, Any] = dict(zip([f.name for f in FIELDS], _columns(log.ticks), strict=True))
-    columns["units"] = {f.name: f.unit for f in FIELDS}
-    columns["meanings"] = {f.name: f.doc for f in FIELDS}
-    columns["run"] = {key.replace(" ", "_").replace("-", "_"): v for key, v in log.metadata["run"].items()}
-    savemat(path, columns, do_compression=True, oned_as="column", long_field_names=True)
-    return log
+
+    def __init__(self, path: Path, log: Log) -> None:
+        self._savemat = need("scipy.io", "MAT").savemat
+        self._path, self._log, self._count = path, log, 0
+        self._columns = [tempfile.TemporaryFile(dir=path.parent) for _ in FIELDS]  # noqa: SIM115 - until close
+
+    def add(self, ticks: TickArray) -> None:
+        """Append ticks to the columns. Raises LogError for more than a variable can hold."""
+        self._count += len(ticks)
+        if self._count > MAT_TICKS:
+            raise LogError(
+                f"{self._log.path}: a variable of a MAT file holds at most {MAT_TICKS} ticks; "
+                "take .parquet or .mf4"
+            )
+        for file, column in zip(self._columns, _columns(ticks), strict=True):
+            file.write(column.data)
+
+    def close(self, *, whole: bool) -> None:
+        """Write the file, when it is whole; let go of the columns."""
+        try:
+            if whole:
+                self._write()
+        finally:
+            for file in self._columns:
+                file.close()
+
+    def _write(self) -> None:
+        """Variable by variable: scipy writes the header at the start of a file alone."""
+        run = self._log.metadata["run"].items()
+        with self._path.open("wb") as stream:
+            for field, file in zip(FIELDS, self._columns, strict=True):
+                file.seek(0)
+                self._put(stream, field.name, np.fromfile(file, f"<{field.kind}"))
+                file.close()  # gives its room on the disk back
+            self._put(stream, "units", {f.name: f.unit for f in FIELDS})
+            self._put(stream, "meanings", {f.name: f.doc for f in FIELDS})
+            self._put(stream, "run", {name.replace(" ", "_").replace("-", "_"): text for name, text in run})
+
+    def _put(self, stream: IO[bytes], name: str, value: Any) -> None:
+        options = {"do_compression": True, "oned_as": "column", "long_field_names": True}
+        self._savemat(stream, {name: value}, **options)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,28 @@ def test_mat(path: Path, tmp_path: Path) -> None:
     assert str(found["units"]["i_q"]) == "A" and str(found["run"]["clock"]) == "lockstep"
 
 
+def test_mat_is_what_scipy_writes_at_once(path: Path, tmp_path: Path) -> None:
+    """Variable by variable or all in one call: the same bytes behind the header, which has the date."""
+    from scipy.io import savemat
+
+    export(path, tmp_path / "a.mat")
+    whole: dict[str, Any] = {name: np.ascontiguousarray(TICKS[name]) for name in NAMES}
+    whole["units"] = {field.name: field.unit for field in FIELDS}
+    whole["meanings"] = {field.name: field.doc for field in FIELDS}
+    whole["run"] = hil.open_log(str(path)).metadata["run"]
+    savemat(tmp_path / "b.mat", whole, do_compression=True, oned_as="column", long_field_names=True)
+    assert (tmp_path / "a.mat").read_bytes()[128:] == (tmp_path / "b.mat").read_bytes()[128:]
+
+
+def test_mat_refuses_more_ticks_than_a_variable_holds(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr("hil.convert.tables.MAT_TICKS", 499)
+    assert main(["export", str(path), "-o", str(tmp_path / "a.mat")]) == 2
+    assert "at most 499 ticks; take .parquet or .mf4" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
 def test_mf4(path: Path, tmp_path: Path) -> None:
     from asammdf import MDF
 
@@ -144,7 +167,7 @@ def test_nothing_is_replaced_without_force(path: Path, tmp_path: Path, capsys: A
     assert main(["export", str(path), "-o", str(out), "--force"]) == 0 and out.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("ending", [*module.FORMATS, module.MAT])
+@pytest.mark.parametrize("ending", list(module.FORMATS))
 def test_what_fails_leaves_nothing_behind(tmp_path: Path, ending: str) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no log at all")
     with pytest.raises(LogError):
@@ -152,21 +175,76 @@ def test_what_fails_leaves_nothing_behind(tmp_path: Path, ending: str) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["bad.mcap"]
 
 
-@pytest.mark.parametrize("ending", [".csv", ".log", ".blf", ".parquet"])
-def test_a_full_disk_is_one_clear_line(path: Path, tmp_path: Path, ending: str) -> None:
-    """A limit on the size of files stands in for the full disk: the same write fails, by the kernel."""
+@pytest.mark.parametrize("ending", list(module.FORMATS))
+@pytest.mark.parametrize("room", [2_000, 20_000])
+def test_a_full_disk_is_one_clear_line(path: Path, tmp_path: Path, ending: str, room: int) -> None:
+    """A limit on the size of files stands in for the full disk: the same write fails, by the kernel.
+
+    A column of ticks fits into 20,000 bytes, but no file does.
+    """
     out = tmp_path / f"a{ending}"
     code = (
         "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000));"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (ROOM, ROOM));"
         "from hil.cli import main; sys.exit(main(sys.argv[1:]))"
-    )
+    ).replace("ROOM", str(room))
     done = subprocess.run(
         [sys.executable, "-c", code, "export", str(path), "-o", str(out)],
         capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
     assert done.returncode == 2 and "can't be written" in done.stderr, done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
+
+
+@pytest.mark.parametrize("ending", list(module.FORMATS))
+def test_ctrl_c_leaves_nothing_behind(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
+) -> None:
+    whole = module._slabs
+
+    def interrupted(*arguments: Any) -> Iterator[Records]:
+        yield next(whole(*arguments))
+        raise KeyboardInterrupt
+
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(module, "_slabs", interrupted)
+    assert main(["export", str(path), "-o", str(tmp_path / f"a{ending}")]) == 130
+    assert sorted(p.name for p in tmp_path.rglob("*")) == ["run.mcap", "tmp"]
+
+
+def test_what_a_killed_export_left_is_replaced(path: Path, tmp_path: Path) -> None:
+    (tmp_path / ".a.csv.part.csv").write_text("half of")
+    assert export(path, tmp_path / "a.csv").records == len(TICKS)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "run.mcap"]
+
+
+@pytest.mark.parametrize("ending", list(module.FORMATS))
+def test_an_export_has_the_rights_that_the_users_umask_gives(path: Path, tmp_path: Path, ending: str) -> None:
+    before = os.umask(0o027)
+    try:
+        export(path, tmp_path / f"a{ending}")
+    finally:
+        os.umask(before)
+    assert (tmp_path / f"a{ending}").stat().st_mode & 0o777 == 0o640
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.slow
+def test_memory_of_mat_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    """Four times the ticks, 200 MB more of them, take less than a quarter of that more."""
+    code = (
+        "import re, sys; from pathlib import Path; from hil.cli import main; main(sys.argv[1:]);"
+        "print('peak', re.findall(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text())[0])"
+    )
+    peaks = []
+    for count in (150_000, 600_000):
+        log = tmp_path / f"{count}.mcap"
+        write_log(log, some_ticks(count), FRAMES[:0], block=2000)
+        words = [sys.executable, "-c", code, "export", str(log), "-o", str(log.with_suffix(".mat"))]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=True)
+        peaks.append(int(done.stdout.rpartition("peak")[2]) / 1e3)
+    assert peaks[1] - peaks[0] < 50, peaks
 
 
 def test_a_log_cut_off_is_exported_as_far_as_it_goes(path: Path, tmp_path: Path) -> None:
