@@ -109,6 +109,32 @@ def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name
     assert replay(tmp_path / "back.mcap").verdict == "same"
 
 
+@pytest.fixture(scope="module")
+def other_protocol(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+    """A drive of another protocol: big endian, extended identifiers, several frames a measurement, no SYNC."""
+    return ran(tmp_path_factory.mktemp("inverter"), "inverter.toml", "import-other", "loop.duration_s=1.0")
+
+
+@pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
+def test_another_protocol_through_every_format_into_replay_and_report(
+    other_protocol: Ran, tmp_path: Path, ending: str, capsys: Any
+) -> None:
+    """Whatever the format, the log that comes back is the same in all but its times."""
+    recording, back = tmp_path / f"a{ending}", tmp_path / "back.mcap"
+    words = ["--config", str(other_protocol.config)]
+    words += [w for setting in other_protocol.settings for w in ("--set", setting)]
+    assert main(["export", str(other_protocol.log), "-o", str(recording), "--frames"]) == 0
+    capsys.readouterr()
+    assert main(["import", str(recording), "-o", str(back), *words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["commands"] == OURS and found["damage"] is None, found
+    assert differing(other_protocol.log, back) <= NOT_ON_THE_WIRE | {"k", "gap", "skipped"}
+    assert main(["replay", str(back), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["verdict"] == "same"
+    assert main(["report", str(back), "-o", str(tmp_path / "r.html"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"][0]["replay"]["verdict"] == "same"
+
+
 def test_another_controllers_commands_are_open_loop(steady: Ran, tmp_path: Path, capsys: Any) -> None:
     export(steady.log, tmp_path / "a.log")
     back, other = tmp_path / "back.mcap", (*steady.settings, "controller.speed_pole_rad_s=25.0")

@@ -1,4 +1,4 @@
-"""`hil watch --foxglove` as its clients see it: protocol, schemas, messages; and the shipped layouts."""
+"""`hil watch --foxglove` as its clients see it: protocol, schemas, messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import re
 import struct
 import subprocess
 import sys
-import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,8 +21,7 @@ from websockets.typing import Subprotocol
 from hil.app import Overrides
 from hil.demo import emulator_process
 from hil.log.schema import TOPICS, file_descriptor_set
-from hil.signals import FIELDS, TICK, DriveState, ticks_from
-from tests.conftest import CONFIGS
+from hil.signals import TICK, DriveState, ticks_from
 from tests.node import has_packages, node
 from tests.process.test_run import flags, hil
 from tests.process.test_watch import wait_for_run
@@ -50,12 +48,6 @@ client.on("message", ({subscriptionId, timestamp, data}) => {
   if (ticks.length === 500) out({channels, ticks});
 });
 """
-
-
-def fields_of(message: str) -> set[str]:
-    """Field names of a message of the logs."""
-    found = {m.name: {f.name for f in m.field} for m in file_descriptor_set().file[0].message_type}
-    return found[message.removeprefix("hil.")]
 
 
 async def talk(url: str) -> tuple[dict[str, Any], dict[str, Any], dict[str, list[bytes]]]:
@@ -144,26 +136,3 @@ def test_without_the_extra_it_is_one_clear_line() -> None:
     )
     assert done.returncode == 2
     assert done.stderr == "hil: foxglove-sdk is not installed: pip install 'hil-drive[foxglove]'\n"
-
-
-@pytest.mark.parametrize("name", ["lichtblick", "lichtblick-live"])
-def test_the_layouts_of_lichtblick_and_foxglove_name_what_is_there(name: str) -> None:
-    layout = json.loads((CONFIGS / "layouts" / f"{name}.json").read_text())
-    panels = layout["configById"]
-    paths = [p["value"] for panel in panels.values() for p in panel.get("paths", [])]
-    assert len(paths) > 12
-    for path in paths:
-        topic, _, field = path.partition(".")
-        assert field in fields_of(TOPICS[topic]), path
-    assert all(panel["topicPath"] in TOPICS for panel in panels.values() if "topicPath" in panel)
-    placed = re.findall(r'"(?:first|second)": "([^"]+)"', json.dumps(layout["layout"]))
-    assert sorted(placed) == sorted(panels)
-    follow = {panel.get("followingViewWidth") for key, panel in panels.items() if key.startswith("Plot!")}
-    assert follow == ({10} if name.endswith("live") else {None})  # live: the last 10 s; a log: all of it
-
-
-def test_the_layout_of_plotjuggler_names_what_is_there() -> None:
-    curves = [c.get("name", "") for c in ET.parse(CONFIGS / "layouts" / "plotjuggler.xml").iter("curve")]
-    assert len(curves) > 8
-    assert {c.removeprefix("/tick/") for c in curves} <= {f.name for f in FIELDS}
-    assert all(c.startswith("/tick/") for c in curves)
