@@ -6,6 +6,7 @@ program's recording nobody can say, so every frame may be one.
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -91,7 +92,7 @@ class Result:
         if not self.sent:
             return 0.0
         at = int(np.searchsorted(np.cumsum(self._bins), math.ceil(share * self.sent)))
-        return min(at + 1.0, self.max_us)
+        return min(at + 1.0, self.max_us) if at < _BINS else self.max_us
 
     def as_dict(self) -> dict[str, Any]:
         """As a plain dict; times in us."""
@@ -112,15 +113,18 @@ class Source:
         if not path.is_file():
             raise LogError(f"{path}: no such file")
         self.path = path
+        self.damage: str | None = None
         self._ours = path.suffix == ".mcap"
         self.roles_known, self._own_ids = self._roles() if self._ours else (False, frozenset())
 
     def _roles(self) -> tuple[bool, frozenset[int]]:
         """Identifiers that the controller itself sent; not known in the log of a shadow run."""
         own: set[int] = set()
-        for block in read_blocks(Log(self.path, new_ticks(0))):
+        log = Log(self.path, new_ticks(0))
+        for block in read_blocks(log):
             if block.kind == "frames":
                 own.update(np.unique(block.records["can_id"][block.records["received"] == 0]).tolist())
+        self.damage = log.damage
         return bool(own), frozenset(own)
 
     def frames(self) -> Iterator[Played]:
@@ -164,11 +168,15 @@ def play(
     there. Ctrl-C ends at once and the result so far is returned.
     """
     result = Result()
+    gc.collect()
+    gc.freeze()  # what is there already need not be looked through again: that took 0.1 s in mid-play
     try:
         for frames in rounds:
             _one_round(frames, send, clock, rate, before, result)
     except KeyboardInterrupt:
         result.interrupted = True
+    finally:
+        gc.unfreeze()
     return result
 
 
@@ -180,9 +188,10 @@ def _one_round(
     before: Callable[[Played], bool],
     result: Result,
 ) -> None:
-    start_ns, first_ns = clock.now_ns() + LEAD_NS, None
+    start_ns, first_ns = 0, None
     for frame in frames:
-        first_ns = frame.t_ns if first_ns is None else first_ns
+        if first_ns is None:  # reading up to it may have taken long
+            start_ns, first_ns = clock.now_ns() + LEAD_NS, frame.t_ns
         deadline_ns = start_ns + round((frame.t_ns - first_ns) / rate)
         if before(frame):
             start_ns += clock.now_ns() - deadline_ns

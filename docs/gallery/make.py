@@ -15,6 +15,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,12 +73,17 @@ def make_run(folder: Path, name: str, *settings: str) -> Path:
     return folder / f"{name}.mcap"
 
 
+def joined(svg: str) -> str:
+    """Rich's picture with letters as high as its lines, so that the frames of tables have no gaps."""
+    return svg.replace("font-size: 20px;\n", "font-size: 21.2px;\n", 1)
+
+
 def terminal(page: Page, folder: Path, what: RenderableType, title: str, picture: str) -> None:
     """What a terminal shows, as a picture."""
     console = Console(width=WIDTH, record=True, file=(folder / "discarded").open("w"))
     console.print(what)
     (folder / "terminal.html").write_text(
-        f"<!doctype html><meta charset=utf-8><title>x</title>{console.export_svg(title=title)}",
+        f"<!doctype html><meta charset=utf-8><title>x</title>{joined(console.export_svg(title=title))}",
         encoding="utf-8",
     )
     page.open(folder / "terminal.html")
@@ -141,6 +147,7 @@ def watch(browser: Browser, folder: Path) -> None:
                 command("run", str(config), *flags(settings)), cwd=ROOT, stdout=subprocess.DEVNULL
             )
             look = watched()
+            look.entry = replace(look.entry, log="logs/live.mcap")
             seen = frame(look, WIDTH)
             look.close()
             web.send_signal(
@@ -149,7 +156,7 @@ def watch(browser: Browser, folder: Path) -> None:
             run.terminate()
             run.wait(60)
         page.evaluate("document.querySelector('#run').style.visibility = 'hidden'")  # where the log is
-        page.picture(OUT / "watch-web.png")
+        page.picture(OUT / "watch-web.png", clip=(0, 0, SIZE[0], page.evaluate("document.body.scrollHeight")))
     finally:
         web.kill()
         web.communicate(timeout=30)

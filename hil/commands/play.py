@@ -52,32 +52,38 @@ def register(commands: Commands) -> None:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError("must be above 0 and finite")
-    return value
+    with contextlib.suppress(ValueError):
+        if 0.0 < (value := float(text)) < float("inf"):
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} must be a number above 0 and finite")
 
 
 def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be 1 or more")
-    return value
+    with contextlib.suppress(ValueError):
+        if (value := int(text)) >= 1:
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, 1 or more")
 
 
 def _number(text: str) -> int:
     """An identifier: decimal, or hexadecimal with 0x."""
-    return int(text, 0)
+    with contextlib.suppress(ValueError):
+        if 0 <= (value := int(text, 0)) < 2**29:
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} must be an identifier below 2^29, as 385 or 0x181")
 
 
 def cmd_play(args: argparse.Namespace) -> int:
     """Play a log."""
     from hil.app import sending_bus
     from hil.clock import RealClock
+    from hil.errors import HilError
     from hil.log.errors import LogError
     from hil.play import Choice, Source, chosen, play
     from hil.view import key_values, show
 
+    if not 0.0 <= args.from_s <= args.to_s:
+        raise HilError(f"--from {args.from_s:g} --to {args.to_s:g}: no such window")
     source = Source(args.log)
     choice = Choice(args.direction, frozenset(args.id), frozenset(args.not_id), args.from_s, args.to_s)
     only_drive = source.roles_known and args.direction == "rx"
@@ -88,10 +94,11 @@ def cmd_play(args: argparse.Namespace) -> int:
         result = play(rounds, send, RealClock(), rate=args.rate, before=before)
     if not (result.sent or result.interrupted):
         raise LogError(f"{args.log}: no frame was chosen; see --direction, --id, --from and --to")
+    found = result.as_dict() | ({"log": source.damage} if source.damage else {})
     if args.json:
-        print_json(result.as_dict())
+        print_json(found)
     else:
-        show(key_values("hil play", result.as_dict()))
+        show(key_values("hil play", found))
     return 130 if result.interrupted else 0
 
 

@@ -17,8 +17,8 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto
 table { border-collapse: collapse; width: 100%; font-size: .82rem }
 td.n { font-family: ui-monospace, monospace }
 td, th { text-align: left; vertical-align: top; padding: .3rem .5rem; border-bottom: 1px solid #ddd }
-.equal::before { content: "= " } .corrected::before { content: "\\2248 " }
-.cannot::before { content: "\\2715 " }
+.equal::before { content: "= " } .corrected::before { content: "\\2248  " }
+.cannot::before { content: "\\2715  " }
 .verdict { font-weight: 600; white-space: nowrap } .equal { color: #1d6b2f } .corrected { color: #8a5a00 }
 .cannot { color: #a8200d } figure { margin: 1.5rem 0; break-inside: avoid }
 figure img { width: 100%; max-width: 46rem }

@@ -34,6 +34,9 @@ def picture(runs: Sequence[Run]) -> bytes:
             axis.set_visible(False)
         for axis, plot in zip(axes, plots, strict=False):
             _draw(axis, plot, runs)
+        for axis in axes[len(plots) - 2 : len(plots)]:  # the last of each column
+            axis.tick_params(labelbottom=True)
+            axis.set_xlabel("t [s]", fontsize=7)
         out = io.BytesIO()
         figure.savefig(out, format="png")
     return out.getvalue()
@@ -61,10 +64,11 @@ def _draw(axis: Any, plot: Plot, runs: Sequence[Run]) -> None:
     limits = limits_text(runs[0].lines().get(plot.key, []))
     title = f"{plot.title} [{plot.unit}]" if plot.unit else plot.title
     axis.set_title(f"{title}   {limits}".rstrip(), loc="left", fontsize=8)
-    axis.set_xlabel("t [s]", fontsize=7)
     if plot.names:
         axis.set_yticks(range(len(plot.names)), plot.names, fontsize=6)
         axis.set_ylim(-0.5, len(plot.names) - 0.5)
+    elif not plot.unit:  # counts: none of them is no reason to look closer
+        axis.set_ylim(0.0, max(1.0, 1.05 * axis.get_ylim()[1]))
     for event in runs[0].events(MOST_EVENTS):
         axis.axvline(
             event["t"],

@@ -62,8 +62,8 @@ def curves(ticks: TickArray, width: int) -> Table:
         values = ticks[name].astype(np.float64) * (1e-3 if unit == "us" else 1.0)
         if len(values):
             line = Text(sparkline(values, max(10, width - 56), least), style=colour)
-            ends = f"{values.min():.2f} .. {values.max():.2f}"
-            table.add_row(label, f"{values[-1]:.2f}", Text(unit, style="dim"), line, Text(ends, style="dim"))
+            ends = f"{values.min():z.2f} .. {values.max():z.2f}"
+            table.add_row(label, f"{values[-1]:z.2f}", Text(unit, style="dim"), line, Text(ends, style="dim"))
     return table
 
 

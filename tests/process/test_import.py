@@ -111,7 +111,7 @@ def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name
 
 @pytest.fixture(scope="module")
 def other_protocol(tmp_path_factory: pytest.TempPathFactory) -> Ran:
-    """A drive of another protocol: big endian, extended identifiers, several frames a measurement, no SYNC."""
+    """A drive of another protocol: big endian, extended identifiers, CAN FD, no SYNC."""
     return ran(tmp_path_factory.mktemp("inverter"), "inverter.toml", "import-other", "loop.duration_s=1.0")
 
 

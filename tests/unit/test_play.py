@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
+import json
 import os
 import pty
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +84,70 @@ def test_lateness_is_counted_and_does_not_move_later_deadlines(path: Path) -> No
     assert result.late == 4 and result.max_us == 5000.0  # 5, 4, 3, 2 ms
     assert result.quantile_us(0.5) == 1.0 and result.quantile_us(0.97) == 2001.0
     assert bus.sent[-1][0] == LEAD_NS + 99 * PERIOD_NS
+
+
+def test_a_long_way_to_the_first_frame_makes_none_late(path: Path) -> None:
+    """Reading up to the window takes its time; the distances count from there."""
+    clock = FakeClock()
+    bus, source = Bus(clock), Source(path)
+
+    def slowly() -> Iterator[Played]:
+        clock.advance(500_000_000)
+        yield from chosen(source, Choice(from_s=0.05))
+
+    result = play([slowly()], bus, clock)
+    assert result.sent == 50 and result.max_us == 0.0
+    assert np.array_equal(np.diff([t for t, *_ in bus.sent]), np.full(49, PERIOD_NS))
+
+
+def test_lateness_beyond_the_histogram_is_the_largest(path: Path) -> None:
+    _, result = played(path, Choice(), late=[0] * 50 + [700_000_000])
+    assert result.quantile_us(0.99) == result.max_us == 700_000.0 and result.quantile_us(0.5) == 1.0
+
+
+def test_the_collector_does_not_look_at_old_objects_while_playing(path: Path) -> None:
+    frozen = []
+
+    def send(*frame: Any) -> None:
+        frozen.append(gc.get_freeze_count())
+
+    play([chosen(Source(path), Choice())], send, FakeClock())
+    assert min(frozen) > 1000 and gc.get_freeze_count() == 0
+
+
+BAD_FLAGS = {
+    "rate 0": (["--rate", "0"], "above 0"),
+    "rate nan": (["--rate", "nan"], "above 0"),
+    "rate word": (["--rate", "fast"], "'fast' must be a number"),
+    "loop 0": (["--loop", "0"], "1 or more"),
+    "loop word": (["--loop", "twice"], "'twice' must be a whole number"),
+    "id word": (["--id", "181h"], "'181h' must be an identifier"),
+    "id negative": (["--not-id", "-1"], "below 2^29"),
+    "id too large": (["--id", "0x20000000"], "below 2^29"),
+    "window backwards": (["--from", "1", "--to", "0.5"], "--from 1 --to 0.5: no such window"),
+    "window before the log": (["--from", "-1"], "no such window"),
+    "window nan": (["--from", "nan"], "no such window"),
+}
+
+
+@pytest.mark.parametrize("case", list(BAD_FLAGS))
+def test_flags_that_make_no_sense_are_refused(path: Path, channel: str, capsys: Any, case: str) -> None:
+    flags, said = BAD_FLAGS[case]
+    try:
+        code = main(["play", str(path), "-i", "hil-local", "-c", channel, *flags])
+    except SystemExit as refused:  # argparse's own way out
+        code = int(refused.code or 0)
+    assert code == 2 and said in capsys.readouterr().err
+
+
+def test_a_damaged_log_is_played_as_far_as_it_goes_and_says_so(
+    path: Path, tmp_path: Path, channel: str, capsys: Any
+) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(path.read_bytes()[: path.stat().st_size * 6 // 10])
+    assert main(["play", str(cut), "-i", "hil-local", "-c", channel, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert 0 < found["frames sent"] < 100 and found["log"].startswith("damaged")
 
 
 def test_ctrl_c_ends_at_once_with_what_was_played(path: Path) -> None:
