@@ -35,7 +35,7 @@ from drivers.jit import entry
 from drivers.local import CLASSIC, ERR_FLAG, FD
 from drivers.mapping import DriveMap, house_map
 from drivers.port import COMPILED, SocketPort
-from drivers.posix import DRAIN_MOST, FLAGS, PENDING, REFUSED_COMMAND, SEEN, SIZE
+from drivers.posix import DRAIN_MOST, FLAGS, PENDING, REFUSED_COMMAND, SEEN, SIZE, UNSENT
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
@@ -125,7 +125,7 @@ class DriveClient:
         shared = {"state": self._state, "words": self._words, "log": self._log}
         self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
         self._drain_socket: Callable[[int, bool], int] | None = None
-        self._latch: Callable[[int], int] | None = None
+        self._exchange: Callable[[int, int], int] | None = None
         self._command: Callable[[], int] | None = None
 
     def _make_senders(self) -> None:
@@ -145,8 +145,6 @@ class DriveClient:
             self._sync.raw[4] = min(self._sync.message.length, 1)
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
-            if self._port is not None:
-                self._latch = self._port.latcher({"raw": self._sync.raw}, len(self._sync.view))
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -162,7 +160,11 @@ class DriveClient:
         self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
         if self._port is not None:
             incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
-            self._drain_socket = self._port.drainer({"tick": raw, **incoming}, _offset(tick, "rx_flags"))
+            own = {"tick": raw, **incoming}
+            self._drain_socket = self._port.drainer(own, _offset(tick, "rx_flags"))
+            if self._sync is not None:
+                size = len(self._sync.view)
+                self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
             if len(self._outgoing) == 1:
                 fields = np.array([_offset(tick, name) for name in _SENT_FIELDS], np.int64)
                 own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": fields}
@@ -177,19 +179,24 @@ class DriveClient:
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
         self._cells[_GOT] = 0
-        if self._latch is None or tick is not self._tick or self._pending_flags or self._down:
-            self._take_late(tick)
-            self._send_sync()
-            return
-        count = self._sync_counter % 240 + 1
-        code = self._latch(count)
+        self._take_late(tick)
+        self._send_sync()
+
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """:meth:`sync` and :meth:`receive`, in one compiled call where nothing is late. Raises as they do."""
+        exchange, code = self._exchange, PENDING
+        if exchange is not None and tick is self._tick and not (self._pending_flags or self._down):
+            count = self._sync_counter % 240 + 1
+            code = exchange(count, deadline_ns)
         if code == PENDING:
-            self._take_late(tick)
-            self._send_sync()
+            self.sync(tick)
+            self.receive(tick, deadline_ns)
             return
         self._sync_counter = count
-        if code < 0:
-            self._fail(code)
+        if code:
+            if code <= UNSENT:
+                self._fail(code - UNSENT)
+            self._judge(code, deadline_ns)
 
     def _take_late(self, tick: Any) -> None:
         self._late = True
@@ -217,8 +224,12 @@ class DriveClient:
             self.prepare(tick)
         drain = self._drain_socket
         code = 0 if drain is None else drain(deadline_ns, self._late)
-        if not (code or drain is None or self._pending_flags or self._down):
-            return
+        if code or drain is None or self._pending_flags or self._down:
+            self._judge(code, deadline_ns)
+
+    def _judge(self, code: int, deadline_ns: int) -> None:
+        """Take what the kernel handed back, or all where there is none; the flags of it go into the tick."""
+        drain = self._drain_socket
         flags, self._pending_flags = self._pending_flags, 0
         try:
             flags |= self._drain(deadline_ns) if drain is None else self._go_on(code, drain, deadline_ns)

@@ -1,4 +1,4 @@
-"""The client's way to a socket by the kernels of :mod:`drivers.posix`: three calls a tick."""
+"""The client's way to a socket by the kernels of :mod:`drivers.posix`: two calls a tick."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numba.core import config
 
 from drivers.bus import SocketLink
 from drivers.jit import entry
-from drivers.posix import DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, latch, places_of
+from drivers.posix import DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, exchange, places_of
 
 COMPILED = not config.DISABLE_JIT  # type: ignore[attr-defined]
 """The kernels call the C library, which the interpreted form can't."""
@@ -47,9 +47,11 @@ class SocketPort:
         """Let the next drain begin anew."""
         self.io[FLAGS], self.io[MORE] = 0, DRAIN_MOST
 
-    def latcher(self, own: Arrays, size: int) -> Callable[[int], int]:
-        """:func:`drivers.posix.latch` for a SYNC that is laid out; its count is to be given."""
-        return self._over(latch, own, size, free=(0,))
+    def exchanger(self, own: Arrays, size: int) -> Callable[[int, int], int]:
+        """:func:`drivers.posix.exchange` for a SYNC that is laid out; called with count and deadline."""
+        made = self._over(exchange, own, size, free=(0, 0))
+        self.restart()
+        return made
 
     def commander(self, own: Arrays) -> Callable[[], int]:
         """:func:`drivers.posix.command` for one message."""

@@ -4,8 +4,8 @@
 frame, each handed to :func:`drivers.wire.take`. What it can't judge itself it hands back to the caller, who
 calls again to go on. The symbols are the process's own (POSIX), so that the compiled form can be cached.
 
-To unpack an array of numpy's at every call costs more than what most kernels here do with it. The three that
-a tick calls take one array instead: the places (address and length) of all the others, as :func:`places_of`
+To unpack an array of numpy's at every call costs more than what most kernels here do with it. Those that a
+tick calls take one array instead: the places (address and length) of all the others, as :func:`places_of`
 writes them down.
 """
 
@@ -43,6 +43,8 @@ DONE, HANDED_BACK, PENDING = range(3)
 """What a kernel returns: it is done; the caller has a frame to judge or the log is full; frames wait."""
 REFUSED_COMMAND: Final = -1000
 """A value of the command fits no signal; other negative results are -errno."""
+UNSENT: Final = -2000
+"""What -errno of a SYNC that was not sent is added to."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
 FLAGS, SEEN, SIZE, MORE, FLAGS_AT = range(5)
 DRAIN_MOST: Final = 256
@@ -52,10 +54,11 @@ ARRAYS: Final = {
     "fds": np.dtype("i4"), "times": np.dtype("i8"), "io": np.dtype("i8"), "raw": np.dtype("u1"),
     "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
     "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
+    "sync": np.dtype("u1"),
 }  # fmt: skip
 """The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
 kernels here, the others of :mod:`drivers.wire`."""
-FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST, STATES, WORDS, TICK, LOG, FIELDS = range(13)
+FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST, STATES, WORDS, TICK, LOG, FIELDS, SYNC = range(14)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
 
 
@@ -172,17 +175,22 @@ def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
     return DONE
 
 
-@jit
-def latch(places: Any, size: int, count: int) -> Any:
-    """Send SYNC with its count, unless frames wait to be taken as late ones. PENDING, DONE or -errno."""
-    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, RAW, U1)
+@waiting
+def exchange(places: Any, size: int, count: int, deadline_ns: int) -> Any:
+    """Send SYNC with its count and :func:`drain`, unless frames wait to be taken as late ones: PENDING.
+
+    Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
+    """
+    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, SYNC, U1)
     state, log = _array(places, STATES, STATE), _array(places, LOG, FRAME)
     if wait(fds, times, 0) != 0:
         return PENDING
+    state[0]["got"] = 0
     if raw[4] > 0:
         raw[DATA_AT] = count
     note(log, state[0], raw, 0, now_ns(times))
-    return transmit(fds, raw, size, state, log)
+    code = transmit(fds, raw, size, state, log)
+    return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
 
 
 @jit

@@ -78,16 +78,23 @@ class GuardedDrive:
         )
         self._drive.prepare(tick)
 
-    def sync(self, tick: Any) -> None:
-        """SYNC, unless the guardian has stopped the drive."""
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """SYNC, unless the guardian has stopped the drive; feedback, and what the guardian did."""
         words = self._words
         words[BEAT_NS] = self._now()
-        if not words[FIRED]:
-            self._drive.sync(tick)
+        if words[FIRED]:
+            self.receive(tick, deadline_ns)
+            return
+        self._drive.exchange(tick, deadline_ns)
+        if words[FIRED] or words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS:
+            self._note_guardian()
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Feedback, and what the guardian did."""
         self._drive.receive(tick, deadline_ns)
+        self._note_guardian()
+
+    def _note_guardian(self) -> None:
         words = self._words
         if words[FIRED]:
             self._flags[0] |= GUARDIAN

@@ -238,11 +238,9 @@ class Loop:
     def _exchange(self, tick: Any, deadline_ns: int) -> None:
         """SYNC out and feedback in."""
         try:
-            self._drive.sync(tick)
+            self._drive.exchange(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
         except OSError as error:
             self._cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
-            return
-        self._drive.receive(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
 
     def _send(self, tick: Any) -> None:
         """Send the command; a bus that does not take it is seen by the supervisor in the next tick."""

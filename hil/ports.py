@@ -16,10 +16,11 @@ class Drive(Protocol):
     def prepare(self, tick: Any) -> None:
         """Get ready for this very record, which every tick fills; sends nothing. Once, before the first."""
 
-    def sync(self, tick: Any) -> None:
-        """Send SYNC: the drive latches the newest command, samples and answers with its feedback.
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """Send SYNC, then :meth:`receive`: the drive latches the newest command, samples and answers.
 
-        What arrived since the last tick is taken first; feedback among it is late and not applied.
+        What arrived since the last tick is taken first; feedback among it is late and not applied. Raises
+        OSError when SYNC can't be sent.
         """
 
     def receive(self, tick: Any, deadline_ns: int) -> None:

@@ -26,8 +26,9 @@ class ShadowDrive:
         """Get ready for the record."""
         self._drive.prepare(tick)
 
-    def sync(self, tick: Any) -> None:
-        """Send nothing: another controller sends SYNC."""
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """Send nothing, another controller sends SYNC; only receive."""
+        self.receive(tick, deadline_ns)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Wait for feedback; note what the other controller has applied from now on."""

@@ -20,12 +20,11 @@ from typing import Any, Final
 LOOP: Final = "loop"
 PHASES: Final[dict[str, tuple[str, ...]]] = {
     "sleep": ("hil.clock:RealClock.sleep_until",),
-    "sync": ("drivers.client:DriveClient.sync",),
-    "receive, check, decode": ("drivers.client:DriveClient.receive",),
+    "sync, receive, check, decode": tuple(f"drivers.client:DriveClient.{x}" for x in ("exchange", "receive")),
     "control and guard": ("hil.design:Machine.looped()",),
     "encode, send": ("drivers.client:DriveClient.send",),
     "record": ("hil.log.recorder:Recorder.tick", "hil.log.recorder:Recorder.frames"),
-    "guardian": tuple(f"hil.guardian:GuardedDrive.{name}" for name in ("sync", "receive", "send")),
+    "guardian": tuple(f"hil.guardian:GuardedDrive.{x}" for x in ("exchange", "receive", "send")),
 }
 """Where each phase is; what is in none of them is ``loop``. A method with () makes
 what is called; one that is not there is left out."""

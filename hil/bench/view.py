@@ -14,7 +14,7 @@ COMPARED: Final = {
     "processor_us": "lower",
     "bare_processor_us": "lower",
     "processor_ratio": "lower",
-    "tick_us.receive, check, decode": "lower",
+    "tick_us.sync, receive, check, decode": "lower",
     "tick_us.control": "lower",
     "tick_us.guard": "lower",
     "tick_us.encode, send": "lower",

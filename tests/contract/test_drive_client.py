@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from drivers import frames
 from drivers.bus import BusSettings, Frame, Link, open_link
 from drivers.client import STOP_REPEATS, DriveClient
 from drivers.codec import Database
-from drivers.errors import EncodeError, LinkDown, QueueFull
+from drivers.errors import EncodeError, LinkDown, LinkError, QueueFull
 from drivers.local import EFF_FLAG, ERR_FLAG, RTR_FLAG
 from drivers.wire import FRAME
 from hil.signals import RxFlag, new_ticks
@@ -275,6 +277,59 @@ def test_late_feedback_is_not_fresh(bench: Bench) -> None:
     bench.feed("FEEDBACK", Counter=2, Speed=6.0)
     assert bench.receive(2.0) == RxFlag.FRESH, "the late frame's counter counted"
     assert bench.tick["w"] == 6.0
+
+
+@contextmanager
+def answering(bench: Bench, **values: float) -> Iterator[list[int]]:
+    """The other end answers each SYNC with feedback; yields the counts of the SYNCs that it saw."""
+    counts: list[int] = []
+    over = threading.Event()
+
+    def answer() -> None:
+        while not over.is_set():
+            frame = bench.peer.receive(10_000_000)
+            if frame is not None and frame.can_id == 0x80:
+                counts.append(frame.data[0])
+                bench.feed("FEEDBACK", Counter=len(counts) % 16, **values)
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        yield counts
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_an_exchange_is_sync_and_feedback(bench: Bench) -> None:
+    bench.client.prepare(bench.tick)
+    with answering(bench, Speed=3.0) as counts:
+        for _ in range(242):
+            bench.tick["rx_flags"] = 0
+            bench.client.exchange(bench.tick, time.monotonic_ns() + 2 * 10**9)
+            assert bench.tick["rx_flags"] == RxFlag.FRESH
+    assert counts == [*range(1, 241), 1, 2] and bench.tick["w"] == 3.0
+
+
+def test_an_exchange_takes_what_is_late_first_and_may_hear_nothing(bench: Bench) -> None:
+    bench.client.prepare(bench.tick)
+    bench.feed("FEEDBACK", Counter=0, Speed=5.0)
+    bench.tick["rx_flags"] = 0
+    bench.client.exchange(bench.tick, 1)
+    assert (bench.tick["rx_flags"], bench.tick["w"]) == (0, 0.0), "the late feedback is not applied"
+    assert [frame.data for frame in bench.heard()] == [b"\x01"]
+    bench.client.exchange(bench.tick, 1)
+    assert [frame.data for frame in bench.heard()] == [b"\x02"]
+    with answering(bench, Speed=6.0):
+        bench.client.exchange(bench.tick, time.monotonic_ns() + 2 * 10**9)
+    assert (bench.tick["rx_flags"], bench.tick["w"]) == (RxFlag.FRESH, 6.0)
+
+
+def test_an_exchange_on_a_closed_bus_says_so(bench: Bench) -> None:
+    bench.client.prepare(bench.tick)
+    bench.client.close()
+    with pytest.raises(LinkError):
+        bench.client.exchange(bench.tick, 1)
 
 
 def test_sync_counts_from_1_to_240(bench: Bench) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import gc
+import os
+import signal
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from drivers.bus import BusSettings, open_link
+from drivers.bus import BusSettings, Link, open_link
 from drivers.client import DriveClient
 from hil.app import Overrides, header_of, load_setup
 from hil.clock import LockstepClock
@@ -22,20 +23,17 @@ pytestmark = [pytest.mark.process, pytest.mark.compiled]
 TICKS, SETTLED = 1900, 300  # the drive never enables: the run ends itself after 2000
 
 
-class Answered:
-    """The drive client, with the other end of the bus answering each SYNC."""
-
-    def __init__(self, client: DriveClient, peer: Any, answers: list[bytes]) -> None:
-        self._client, self._peer, self._answers, self._k = client, peer, answers, 0
-        self.prepare, self.receive, self.send, self.stop, self.close = (
-            client.prepare, client.receive, client.send, client.stop, client.close,
-        )  # fmt: skip
-
-    def sync(self, tick: Any) -> None:
-        self._client.sync(tick)
-        self._k += 1
-        self._peer.send(0x181, self._answers[self._k % 16])
-        self._peer.discard()
+def answering(peer: Link, answers: list[bytes]) -> int:
+    """A process that answers each SYNC; its id."""
+    pid = os.fork()
+    if pid == 0:
+        k = 0
+        while True:
+            frame = peer.receive(10**9)
+            if frame is not None and frame.can_id == 0x80:
+                k += 1
+                peer.send(0x181, answers[k % 16])
+    return pid
 
 
 def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
@@ -43,6 +41,7 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
     machine, ticks = setup.machine.fresh(), new_ticks()
     setup.machine.warm_up()
     recorder = Recorder(tmp_path / "run.mcap", header_of(setup, "run", "lockstep"), 2000)
+    recorder.await_open()
     settings = BusSettings("hil-local", channel)
     peer, link = open_link(settings), open_link(settings)
     client = DriveClient(link, setup.database, on_frames=recorder.frames)
@@ -60,14 +59,16 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
             seen.append((gc.get_count()[0], sys.getallocatedblocks()))
 
     plan = Plan(1_000_000, 800_000, "sync", TICKS)
-    drive = Answered(client, peer, answers)
-    loop = Loop(drive, LockstepClock(), recorder, step, ticks, plan, StopRequest())
+    drive = answering(peer, answers)
+    loop = Loop(client, LockstepClock(), recorder, step, ticks, plan, StopRequest())
     gc.collect()
     gc.disable()
     try:
         loop.run()
     finally:
         gc.enable()
+        os.kill(drive, signal.SIGKILL)
+        os.waitpid(drive, 0)
         recorder.close({})
         client.close()
         peer.close()

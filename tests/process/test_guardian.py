@@ -190,7 +190,7 @@ class Quiet:
 
     def prepare(self, tick: Any) -> None: ...
 
-    def sync(self, tick: Any) -> None:
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
         self.sent += 1
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
@@ -220,8 +220,7 @@ def test_a_loop_that_hangs_is_stopped_and_stays_stopped() -> None:
         time.sleep(0.5)  # the hang
         assert set(os.read(ours, 100)) == {7} and words.cells[Word.FIRED] == 1
         before = drive.sent
-        guarded.sync(tick)
-        guarded.receive(tick, 0)
+        guarded.exchange(tick, 0)
         with pytest.raises(OSError, match="guardian has stopped"):
             guarded.send(tick)
         guarded.stop()

@@ -180,8 +180,8 @@ class Port:
     def prepare(self, tick: Any) -> None:
         self.called.append("prepare")
 
-    def sync(self, tick: Any) -> None:
-        self.called.append("sync")
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        self.called.append(("sync", deadline_ns))
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         self.called.append(deadline_ns)
@@ -212,7 +212,7 @@ class Guarded:
 
 def test_a_tick_beats_and_is_passed_on() -> None:
     g = Guarded()
-    g.drive.sync(g.tick)
+    g.drive.exchange(g.tick, 122)
     assert g.cells[Word.BEAT_NS] == 5_000
     g.now_ns = 6_000
     g.drive.receive(g.tick, 123)
@@ -220,7 +220,7 @@ def test_a_tick_beats_and_is_passed_on() -> None:
     g.drive.send(g.tick)
     assert g.cells[Word.BEAT_NS] == 6_000
     g.drive.close()
-    assert g.port.called == ["sync", 123, "send", "close"]
+    assert g.port.called == [("sync", 122), 123, "send", "close"]
 
 
 @pytest.mark.parametrize("state", list(DriveState))
@@ -250,6 +250,29 @@ def test_what_the_guardian_did_is_flagged(fired: int, age: int, flags: int) -> N
     assert int(g.tick["rx_flags"]) == flags
 
 
+@pytest.mark.parametrize(
+    ("age", "fires", "flags"),
+    [
+        (0, 0, FRESH),
+        (GUARDIAN_LOST_NS, 0, FRESH),
+        (GUARDIAN_LOST_NS + 1, 0, FRESH | LOST),
+        (0, 1, FRESH | GUARDIAN),
+    ],
+)
+def test_what_the_guardian_did_during_an_exchange_is_flagged(age: int, fires: int, flags: int) -> None:
+    g = Guarded()
+    g.now_ns = 1_000 + age
+    g.cells[Word.GUARD_NS] = 1_000
+
+    def exchange(tick: Any, _: int) -> None:
+        tick["rx_flags"] = FRESH
+        g.cells[Word.FIRED] = fires
+
+    g.port.exchange = exchange  # type: ignore[method-assign]
+    g.drive.exchange(g.tick, 1)
+    assert int(g.tick["rx_flags"]) == flags
+
+
 def test_a_guardian_is_lost_after_half_a_second() -> None:
     assert GUARDIAN_LOST_NS == 500_000_000
 
@@ -266,8 +289,9 @@ def test_after_the_latch_nothing_is_passed_on() -> None:
     """The controller beats on, so that the guardian sees it, and says which counter came last."""
     g = Guarded(fired=1)
     g.tick["counter"], g.tick["state"] = 3, int(DriveState.OPERATION_ENABLED)
-    g.drive.sync(g.tick)
-    assert g.cells[Word.BEAT_NS] == 5_000
+    g.drive.exchange(g.tick, 9)
+    assert g.cells[Word.BEAT_NS] == 5_000 and g.port.called.pop() == 9, "it still hears"
+    assert int(g.tick["rx_flags"]) == GUARDIAN
     g.now_ns = 6_000
     assert fails(lambda: g.drive.send(g.tick))
     assert (g.cells[Word.BEAT_NS], g.cells[Word.COUNTER], g.cells[Word.ARMED]) == (6_000, 3, 1)

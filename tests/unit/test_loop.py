@@ -31,8 +31,9 @@ class ScriptedDrive:
     def prepare(self, tick: Any) -> None:
         self.calls.append("prepare")
 
-    def sync(self, tick: Any) -> None:
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
         self._note("sync")
+        self.receive(tick, deadline_ns)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         self._note("receive")
