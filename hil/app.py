@@ -412,6 +412,7 @@ def _recorded(
         with opened_client(setup, recorder, clock, watch) as client:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             _await_drive(setup, client)
+            recorder.await_open()
             say(f"{'listening only' if watch else 'arming'}; log {path}")
             client.discard()
             drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json
 
 
 def register(commands: Commands) -> None:
@@ -43,8 +43,8 @@ def register(commands: Commands) -> None:
 
 def cmd_emulate(args: argparse.Namespace) -> int:
     """Serve the emulated drive until stopped."""
-    from hil.emulate import serve
-
+    with lean_imports():
+        from hil.emulate import serve
     serve(args.config, overrides(args), args.plant_set)
     return 0
 

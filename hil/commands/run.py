@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
 
 
 def register(commands: Commands) -> None:
@@ -37,7 +37,8 @@ def register(commands: Commands) -> None:
 
 def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
-    from hil.app import check_arming, is_emulated_bus, load_setup, run
+    with lean_imports():
+        from hil.app import check_arming, is_emulated_bus, load_setup, run
     from hil.arming import confirm, requesting
 
     setup = load_setup(args.config, overrides(args))

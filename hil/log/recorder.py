@@ -59,9 +59,11 @@ def check_folder(path: Path, needed_bytes: int) -> None:
 def open_recorder(
     path: Path, header: dict[str, Any], rate_hz: int, duration_s: float | None = None
 ) -> Recorder:
-    """Check the folder for a run of that rate and length (one minute when open) and start the writer."""
+    """Check the folder for a run of that rate and length (one minute when open), open the file there."""
     check_folder(path, round((duration_s or 60.0) * rate_hz * BYTES_PER_TICK))
-    return Recorder(path, header, rate_hz)
+    recorder = Recorder(path, header, rate_hz)
+    recorder.await_open()
+    return recorder
 
 
 def first_line(stream: IO[bytes], timeout_s: float) -> str:
@@ -74,8 +76,8 @@ def first_line(stream: IO[bytes], timeout_s: float) -> str:
 class Recorder:
     """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick.
 
-    ``header`` holds ``metadata`` (text to text) and ``attachments`` (name to text). Raises LogError when
-    the writer can't start.
+    ``header`` holds ``metadata`` (text to text) and ``attachments`` (name to text). The writer starts while
+    the caller goes on; the file is there once :meth:`await_open` has returned.
     """
 
     def __init__(self, path: Path, header: dict[str, Any], rate_hz: int) -> None:
@@ -88,12 +90,7 @@ class Recorder:
         self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
         self._writer = self._spawn()
-        try:
-            self._open(path, header)
-        except LogError:
-            self._end_writer(START_TIMEOUT_S)
-            self._release()
-            raise
+        self._say({"path": str(path), "header": header, "chunk_bytes": CHUNK_BYTES})
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         fds = [ring.fd for ring in (self._ticks, self._frames, self._events)]
@@ -105,13 +102,14 @@ class Recorder:
             start_new_session=True,
         )
 
-    def _open(self, path: Path, header: dict[str, Any]) -> None:
-        """Hand the writer its file and wait until it is open."""
-        self._say({"path": str(path), "header": header, "chunk_bytes": CHUNK_BYTES})
+    def await_open(self) -> None:
+        """Wait until the writer has opened the file. Raises LogError; the recorder is closed then."""
         assert self._writer.stdout is not None  # noqa: S101 - PIPE was asked for
         answer = first_line(self._writer.stdout, START_TIMEOUT_S)
         if answer != "ready":
-            raise LogError(f"{path}: can't be written ({answer or 'the writer process died'})")
+            self._end_writer(START_TIMEOUT_S)
+            self._release()
+            raise LogError(f"{self.path}: can't be written ({answer or 'the writer process died'})")
 
     def _say(self, what: dict[str, Any]) -> None:
         """One JSON line to the writer, if it lives."""

@@ -7,6 +7,7 @@ controller is gone. A write error sets a flag in the ring that the loop reads ev
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import select
@@ -171,7 +172,8 @@ def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
     try:
         file = open_run(Path(opening["path"]), opening["header"], _follower, opening["chunk_bytes"])
         header[BEAT_AT] += 1
-        os.write(1, b"ready\n")
+        with contextlib.suppress(BrokenPipeError):  # a controller that was killed: its records are kept
+            os.write(1, b"ready\n")
         file.finish(serve(rings, file, control))
     except OSError as error:
         header[FAILED_AT] = 1

@@ -235,7 +235,7 @@ def test_refusals_before_arming(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="MB free"):
         open_recorder(tmp_path / "long.mcap", HEADER, RATE_HZ, 1e9)
     with pytest.raises(LogError, match="can't be written"):
-        Recorder(existing, HEADER, RATE_HZ)
+        Recorder(existing, HEADER, RATE_HZ).await_open()
     assert existing.read_bytes() == b"precious" and [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 
 

@@ -250,3 +250,16 @@ def test_a_drive_that_takes_no_sync(configs: Path, settings: Settings, pacing: s
     assert fresh.mean() > 0.9
     assert abs(ticks["w"][1500] - 30.0) < 1.0
     assert replay(Path(result.log)).verdict == "same"
+
+
+@pytest.mark.parametrize("words", [["run"], ["emulate"]])
+def test_a_loop_does_not_import_what_only_exports_need(tmp_path: Path, words: list[str]) -> None:
+    pytest.importorskip("asammdf")
+    (tmp_path / "empty.toml").write_text("")
+    script = (
+        "import sys; from hil import cli; code = cli.main(sys.argv[1:]); import can;"
+        "print(code, 'pandas' in sys.modules, 'asammdf' in sys.modules)"
+    )
+    command = [sys.executable, "-c", script, *words, str(tmp_path / "empty.toml")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.split() == ["2", "False", "False"]
