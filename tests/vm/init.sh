@@ -1,24 +1,17 @@
-#!/bin/busybox sh
-# First process of the bench machine: modules, the host's root by 9p, one writable folder, the job, off.
-/bin/busybox mkdir -p /proc /sys /dev /root
-/bin/busybox mount -t proc proc /proc
-/bin/busybox mount -t sysfs sys /sys
-/bin/busybox mount -t devtmpfs dev /dev
-while read -r module; do /bin/busybox insmod "/modules/$module" || echo "insmod $module failed"; done < /modules/order
-options=trans=virtio,version=9p2000.L,msize=524288,cache=loose
-/bin/busybox mount -t 9p -o "$options,ro" host /root || echo "mounting the host's root failed"
-/bin/busybox mount -t proc proc /root/proc
-/bin/busybox mount -t sysfs sys /root/sys
-/bin/busybox mount -t devtmpfs dev /root/dev
-/bin/busybox mkdir -p /root/dev/shm /root/dev/pts
-/bin/busybox mount -t tmpfs -o mode=1777 shm /root/dev/shm
-/bin/busybox mount -t devpts pts /root/dev/pts
-/bin/busybox mount -t 9p -o "$options" out /root/mnt || echo "mounting the writable folder failed"
-/bin/busybox chroot /root /bin/bash /mnt/job.sh > /root/dev/shm/job.stdout 2> /root/dev/shm/job.stderr
-echo $? > /root/dev/shm/job.code
-/bin/busybox cp /root/dev/shm/job.stdout /root/mnt/stdout
-/bin/busybox cp /root/dev/shm/job.stderr /root/mnt/stderr
-/bin/busybox cp /root/dev/shm/job.code /root/mnt/code
-/bin/busybox sync
+#!/busybox sh
+# First process of the bench machine: modules, the Python that stands by and does the job, what it left, off.
+/busybox mkdir -p /proc /sys /dev /host
+/busybox mount -t proc proc /proc
+/busybox mount -t sysfs sys /sys
+/busybox mount -t devtmpfs dev /dev
+while read -r module; do /busybox insmod "/modules/$module" || echo "insmod $module failed"; done < /modules/order
+read -r python < /standby/python
+# numba fixes its processor with the first import that compiles, which here comes before the tree says which
+/busybox env -i LANG=C.UTF-8 HOME=/dev/shm PYTHONDONTWRITEBYTECODE=1 OPENBLAS_NUM_THREADS=1 \
+    NUMBA_CPU_NAME=generic "$python" /standby/standby.py
+code=$?
+for name in stdout stderr; do /busybox cp "/host/dev/shm/job.$name" "/host/mnt/$name"; done
+echo "$code" > /host/mnt/code
+/busybox sync
 echo o > /proc/sysrq-trigger
-/bin/busybox sleep 60
+/busybox sleep 60

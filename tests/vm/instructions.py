@@ -27,7 +27,9 @@ def boot(timeout_s: float) -> Counted:
     """Count in a machine of its own. Raises MachineError."""
     with tempfile.TemporaryDirectory(prefix="hil-instructions-") as folder:
         result = run_in_machine(
-            "python tests/vm/guest/suite.py instructions", timeout_s=timeout_s, out=Path(folder)
+            ["python", "tests/vm/guest/suite.py", "rehearsal", "instructions"],
+            timeout_s=timeout_s,
+            out=Path(folder),
         )
         left = Path(folder) / "instructions.json"
         if not left.is_file():

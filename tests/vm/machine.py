@@ -1,36 +1,50 @@
 """The bench machine: a Debian kernel with CAN under software emulation, running this very tree.
 
-`python -m tests.vm.machine -- COMMAND...` boots it, runs COMMAND in the tree with the same virtual
-environment and brings back its exit code and output. The machine runs in virtual time (one instruction, one
-nanosecond), so that timing is repeatable; can0 and can1 are two emulated Kvaser cards on one wire.
+`python -m tests.vm.machine -- COMMAND...` wakes it from its image, runs COMMAND in the tree with the same
+virtual environment and brings back its exit code and output. The machine runs in virtual time (one
+instruction, one nanosecond), so that timing is repeatable; can0 and can1 are two emulated Kvaser cards on one
+wire.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
+import json
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
+
+from tests.vm.image import ImageError, key, made, restored
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
+QEMU = "qemu-system-x86_64"
 TOOLS = {
-    "qemu-system-x86_64": "qemu-system-x86",
+    QEMU: "qemu-system-x86",
     "busybox": "busybox-static",
     "cpio": "cpio",
+    "zstd": "zstd",
     "modprobe": "kmod",
     "depmod": "kmod",
     "dpkg": "dpkg",
     "apt-get": "apt",
 }
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "kvaser_pci", "can_raw", "can_bcm", "vcan", "sch_tbf")
+SIGN = "hil.bench_machine=1"
+FAST = "mitigations=off init_on_alloc=0 hardened_usercopy=off"
 TIMEOUT_S = 300.0
+KEPT_KERNELS = 8
+WAKE = b"\n" * 8  # a character that comes before the state is there is lost
 
 
 class MachineError(RuntimeError):
@@ -48,7 +62,7 @@ class Result:
 
 
 def cache_folder() -> Path:
-    """Where kernel and initramfs are kept."""
+    """Where the kernel and the images are kept."""
     given = os.environ.get("HIL_MACHINE_CACHE")
     return Path(given) if given else Path.home() / ".cache" / "hil-bench-machine"
 
@@ -69,7 +83,7 @@ def _run(*command: str, cwd: Path | None = None) -> str:
 
 
 def prepare() -> tuple[Path, Path]:
-    """Return (kernel, initramfs), made if they are not in the cache. Raises MachineError."""
+    """Return (kernel, image), made if they are not in the cache. Raises MachineError."""
     missing = missing_packages()
     if missing:
         raise MachineError(f"the bench machine needs Debian packages: apt-get install {' '.join(missing)}")
@@ -77,11 +91,13 @@ def prepare() -> tuple[Path, Path]:
     cache.mkdir(parents=True, exist_ok=True)
     tree = _kernel_tree(cache)
     kernel = next((tree / "boot").glob("vmlinuz-*"))
-    key = hashlib.sha256((HERE / "init.sh").read_bytes() + repr(MODULES).encode() + kernel.name.encode())
-    initramfs = cache / f"initramfs-{key.hexdigest()[:12]}.cpio"
-    if not initramfs.is_file():
-        _make_initramfs(tree, kernel.name.removeprefix("vmlinuz-"), initramfs)
-    return kernel, initramfs
+    warm_kernels()
+    name = key(_run(QEMU, "--version"), *_qemu(kernel, Path("out")), *MODULES)
+    try:
+        image = made(cache, name, lambda base: _fill(base, tree, kernel), lambda out: _qemu(kernel, out))
+    except (ImageError, OSError, subprocess.SubprocessError) as error:
+        raise MachineError(f"no image of the machine: {error}") from error
+    return kernel, image
 
 
 def _kernel_tree(cache: Path) -> Path:
@@ -106,46 +122,56 @@ def _kernel_tree(cache: Path) -> Path:
     return tree
 
 
-def _make_initramfs(tree: Path, release: str, target: Path) -> None:
+def _fill(folder: Path, tree: Path, kernel: Path) -> None:
     """busybox, the modules in loading order, and init.sh."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "bin").mkdir()
-        (folder / "modules").mkdir()
-        shutil.copy(shutil.which("busybox") or "/bin/busybox", folder / "bin" / "busybox")
-        shutil.copy(HERE / "init.sh", folder / "init")
-        (folder / "init").chmod(0o755)
-        order: list[str] = []
-        for module in MODULES:
-            shown = _run("/usr/sbin/modprobe", "-d", str(tree), "-S", release, "--show-depends", module)
-            for line in shown.splitlines():
-                if line.startswith("insmod "):
-                    path = Path(line.split()[1])
-                    if path.name not in order:
-                        order.append(path.name)
-                        shutil.copy(path, folder / "modules" / path.name)
-        (folder / "modules" / "order").write_text("\n".join(order) + "\n")
-        listing = _run("find", ".", cwd=folder)
-        with target.with_suffix(".part").open("wb") as out:
-            subprocess.run(
-                ["cpio", "-o", "-H", "newc", "--quiet"],
-                cwd=folder,
-                input=listing.encode(),
-                stdout=out,
-                check=True,
-            )
-        target.with_suffix(".part").rename(target)
+    (folder / "modules").mkdir()
+    shutil.copy(shutil.which("busybox") or "/bin/busybox", folder / "busybox")
+    shutil.copy(HERE / "init.sh", folder / "init")
+    (folder / "init").chmod(0o755)
+    release = kernel.name.removeprefix("vmlinuz-")
+    order: list[str] = []
+    for module in MODULES:
+        shown = _run("/usr/sbin/modprobe", "-d", str(tree), "-S", release, "--show-depends", module)
+        for line in shown.splitlines():
+            if line.startswith("insmod "):
+                path = Path(line.split()[1])
+                if path.name not in order:
+                    order.append(path.name)
+                    shutil.copy(path, folder / "modules" / path.name)
+    (folder / "modules" / "order").write_text("\n".join(order) + "\n")
 
 
-def _job(script: str) -> str:
-    """The script that the machine runs: interfaces up, own caches on its tmpfs, then the caller's script."""
-    cache = kernel_cache()
-    python = Path(sys.executable).parent
-    return f"""\
-export PATH={shlex.quote(str(python))}:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
-export PYTHONPATH={shlex.quote(str(ROOT))} HOME=/dev/shm TMPDIR=/dev/shm OUT=/mnt LANG=C.UTF-8
-export NUMBA_CACHE_DIR=/dev/shm/numba PYTHONDONTWRITEBYTECODE=1 OPENBLAS_NUM_THREADS=1
-[ -d {shlex.quote(cache)} ] && cp -r {shlex.quote(cache)} /dev/shm/numba
+def _qemu(kernel: Path, out: Path) -> list[str]:
+    """The machine. Without erms and fsrm the kernel copies words: as bytes it is an instruction each."""
+    return [
+        QEMU, "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot",
+        "-m", "2048", "-smp", "1", "-cpu", "max,-erms,-fsrm", "-accel", "tcg", "-icount", "shift=0,sleep=off",
+        "-kernel", str(kernel), "-append", f"console=ttyS0 quiet panic=-1 {FAST} preempt=full {SIGN}",
+        "-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap",
+        "-virtfs", f"local,path={out},mount_tag=out,security_model=none",
+        "-object", "can-bus,id=c0", "-device", "kvaser_pci,canbus=c0", "-device", "kvaser_pci,canbus=c0",
+    ]  # fmt: skip
+
+
+def _job(command: Sequence[str]) -> str:
+    """What Python in the machine does once it is woken: interfaces up, kernels on its tmpfs, the command."""
+    folders = [
+        str(Path(sys.executable).parent),
+        *(f"{p}/{s}" for p in ("/usr/local", "/usr", "") for s in ("sbin", "bin")),
+    ]
+    environment = {
+        "PATH": ":".join(folders),
+        "PYTHONPATH": str(ROOT),
+        "HOME": "/dev/shm",
+        "TMPDIR": "/dev/shm",
+        "OUT": "/mnt",
+        "LANG": "C.UTF-8",
+        "NUMBA_CACHE_DIR": "/dev/shm/numba",
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    setup = f"""\
+mkdir /dev/shm/numba && cp -r {shlex.quote(str(kernels()))} /dev/shm/numba
 echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up
@@ -155,24 +181,33 @@ for card in can0 can1; do
   ip link set $card txqueuelen 10
   ip link set $card up
 done
-cd {shlex.quote(str(ROOT))}
-{script}
 """
+    job = {"now_s": time.time(), "folder": str(ROOT), "setup": setup, "command": list(command)}
+    return json.dumps(job | {"environment": environment}, indent=1)
 
 
-def kernel_cache() -> str:
-    """Where compiled kernels are kept for the machine."""
-    return os.environ.get("NUMBA_CACHE_DIR") or str(ROOT / ".cache" / "numba")
+def kernels() -> Path:
+    """Folder of the kernels compiled for this tree."""
+    from drivers.jit import cache_folder as folder_of
+
+    return folder_of(ROOT)
 
 
 def warm_kernels() -> None:
-    """Compile on the host what the machine will run: compiling there takes minutes."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": kernel_cache()}
-    with tempfile.TemporaryDirectory() as folder:
-        short = ("--set", "loop.duration_s=0.2", "--set", f'log.folder="{folder}"')
+    """Compile on the host what the machine will run, once for a tree: compiling there takes minutes."""
+    folder = kernels()
+    digest = hashlib.sha256(repr((sys.version, version("numba"))).encode())
+    for path in [HERE / "guest" / "process.py", *sorted((ROOT / "configs").rglob("*.*"))]:
+        digest.update(path.read_bytes())
+    stamp = folder / f"warm-{digest.hexdigest()[:16]}"
+    if stamp.exists():
+        return
+    with tempfile.TemporaryDirectory() as logs:
+        short = ("--set", "loop.duration_s=0.2", "--set", f'log.folder="{logs}"')
         demo = ("hil.cli", "demo", str(ROOT / "configs" / "demo.toml"), "--lockstep", "--json", *short)
         for module in (demo, ("tests.vm.guest.process",)):
             command = [sys.executable, "-m", *module]
+            environment = os.environ | {"NUMBA_CACHE_DIR": str(folder.parent)}
             done = subprocess.run(
                 command,
                 cwd=ROOT,
@@ -184,37 +219,43 @@ def warm_kernels() -> None:
             )
             if done.returncode != 0:
                 raise MachineError(f"{module[0]} does not run on the host: {done.stderr.strip()}")
+    stamp.touch()
+    _prune_kernels(folder.parent)
 
 
-def run_in_machine(script: str, *, timeout_s: float = TIMEOUT_S, out: Path | None = None) -> Result:
-    """Boot, run a bash script in the tree, power off. Raises MachineError when it does not come back."""
-    kernel, initramfs = prepare()
-    warm_kernels()
+def _prune_kernels(base: Path) -> None:
+    """Each change of a source leaves a folder of kernels: keep the newest."""
+    folders = [path for path in base.iterdir() if re.fullmatch("[0-9a-f]{16}", path.name)]
+    for old in sorted(folders, key=lambda path: path.stat().st_mtime, reverse=True)[KEPT_KERNELS:]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def run_in_machine(
+    command: Sequence[str], *, timeout_s: float = TIMEOUT_S, out: Path | None = None
+) -> Result:
+    """Wake the machine, run a command in the tree, power off. Raises MachineError when it does not come back.
+
+    `python FILE` and `python -m MODULE` begin with the packages imported.
+    """
+    kernel, image = prepare()
     folder = out or Path(tempfile.mkdtemp(prefix="hil-machine-"))
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "job.sh").write_text(_job(script))
     for name in ("stdout", "stderr", "code"):
         (folder / name).unlink(missing_ok=True)
-    command = [
-        "qemu-system-x86_64", "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot",
-        "-m", "2048", "-smp", "1", "-cpu", "max", "-accel", "tcg", "-icount", "shift=0,sleep=off",
-        "-kernel", str(kernel), "-initrd", str(initramfs),
-        "-append", "console=ttyS0 quiet panic=-1 mitigations=off preempt=full hil.bench_machine=1",
-        "-serial", f"file:{folder / 'serial.log'}",
-        "-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap",
-        "-virtfs", f"local,path={folder},mount_tag=out,security_model=none",
-        "-object", "can-bus,id=c0", "-device", "kvaser_pci,canbus=c0", "-device", "kvaser_pci,canbus=c0",
-    ]  # fmt: skip
+    (folder / "job.json").write_text(_job(command))
+    serial = folder / "serial.log"
+    wake = [*_qemu(kernel, folder), "-serial", "stdio", "-incoming", restored(image)]
     try:
-        subprocess.run(command, timeout=timeout_s, check=True, capture_output=True, text=True)
+        with serial.open("wb") as log:
+            subprocess.run(
+                wake, input=WAKE, stdout=log, stderr=subprocess.PIPE, timeout=timeout_s, check=True
+            )
     except subprocess.TimeoutExpired as error:
-        raise MachineError(
-            f"the machine did not end within {timeout_s:g} s; see {folder}/serial.log"
-        ) from error
+        raise MachineError(f"the machine did not end within {timeout_s:g} s; see {serial}") from error
     except subprocess.CalledProcessError as error:
-        raise MachineError(f"qemu failed: {error.stderr.strip()}") from error
+        raise MachineError(f"qemu failed: {error.stderr.decode(errors='replace').strip()}") from error
     if not (folder / "code").is_file():
-        raise MachineError(f"the job left no exit code; see {folder}/serial.log")
+        raise MachineError(f"the job left no exit code; see {serial}")
     return Result(
         int((folder / "code").read_text()),
         (folder / "stdout").read_text(errors="replace"),
@@ -226,9 +267,7 @@ def run_in_machine(script: str, *, timeout_s: float = TIMEOUT_S, out: Path | Non
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(prog="python -m tests.vm.machine", description=__doc__)
-    parser.add_argument(
-        "--prepare", action="store_true", help="only fetch the kernel and build the initramfs"
-    )
+    parser.add_argument("--prepare", action="store_true", help="only fetch the kernel and make the image")
     parser.add_argument("--timeout", type=float, default=TIMEOUT_S, metavar="S")
     parser.add_argument("--out", type=Path, help="folder that the machine may write to (/mnt there)")
     parser.add_argument("command", nargs="*", help="command to run in the tree, after --")
@@ -237,7 +276,7 @@ def main() -> int:
         if args.prepare:
             print(*prepare())
             return 0
-        result = run_in_machine(shlex.join(args.command), timeout_s=args.timeout, out=args.out)
+        result = run_in_machine(args.command, timeout_s=args.timeout, out=args.out)
     except MachineError as error:
         print(f"machine: {error}", file=sys.stderr)
         return 2

@@ -95,10 +95,10 @@ def read_in() -> None:
 
     While a process waits for it the virtual time of all others goes on, which looks like a stall of the loop.
     """
-    lines = Path("/proc/self/maps").read_text().splitlines()
-    for name in {line.split(maxsplit=5)[5] for line in lines if "/" in line and " (deleted)" not in line}:
-        if (path := Path(name)).is_file():
-            path.read_bytes()
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        words = line.split(maxsplit=5)
+        if len(words) == 6 and (path := Path(words[5])).is_file() and path.stat().st_ino == int(words[4]):
+            path.read_bytes()  # those of the image are in memory, and are not the host's of that name
 
 
 if __name__ == "__main__":
