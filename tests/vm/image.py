@@ -97,9 +97,8 @@ def initramfs(base: Path, listed: dict[str, Any], out: Path) -> None:
     archive(root, sorted({way for file in listed["files"] for way in with_way(Path(file))} - {root}), out)
 
 
-def save(command: Sequence[str], serial: Path, image: Path) -> None:
+def save(command: Sequence[str], serial: Path, part: Path) -> None:
     """Boot, wait until Python stands by, write the machine's state to the file. Raises ImageError."""
-    part = image.with_suffix(".part")
     begin_s = time.monotonic()
     serial.unlink(missing_ok=True)
     with subprocess.Popen(
@@ -121,8 +120,6 @@ def save(command: Sequence[str], serial: Path, image: Path) -> None:
             _ask(machine, "quit")
         finally:
             machine.kill()
-    image.with_suffix(".sha256").write_text(digest_of(part))
-    part.rename(image)
 
 
 def restored(image: Path) -> str:
@@ -150,7 +147,8 @@ def prune(cache: Path) -> None:
     images = sorted(cache.glob("image-*.zst"), key=lambda path: path.stat().st_mtime, reverse=True)
     for old in images[KEPT:]:
         old.unlink()
-        old.with_suffix(".sha256").unlink(missing_ok=True)
+        for beside in (".sha256", ".log"):
+            old.with_suffix(beside).unlink(missing_ok=True)
 
 
 def made(cache: Path, name: str, fill: Callable[[Path], None], machine: Callable[[Path], list[str]]) -> Path:
@@ -170,6 +168,9 @@ def made(cache: Path, name: str, fill: Callable[[Path], None], machine: Callable
         base.mkdir()
         fill(base)
         initramfs(base, packages(), ram)
-        save([*machine(folder), "-initrd", str(ram)], cache / "serial.log", image)
+        part = folder / "part"
+        save([*machine(folder), "-initrd", str(ram)], image.with_suffix(".log"), part)
+        image.with_suffix(".sha256").write_text(digest_of(part))
+        part.rename(image)
     prune(cache)
     return image
