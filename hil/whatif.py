@@ -139,6 +139,8 @@ def what_if(source: Source, config_path: Path, config: RunConfig, out: Path | No
     """Run the controller of ``config`` over a log; ``out`` gets the ticks. Raises HilError."""
     log = new_log(source)
     if out is not None:
+        if out.exists():
+            raise HilError(f"{out}: exists already; name another file with -o")
         check_folder(out.resolve(), sum(path.stat().st_size for path in log.parts or (log.path,)))
     found = WhatIf(log.path, config_path, written=out)
     machine: Machine | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 
 from hil.commands.common import Commands, print_json, say
 
@@ -15,24 +16,23 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "run_name", nargs="?", metavar="RUN", help="PID, channel or log; needed with several runs"
     )
-    command.add_argument("--once", action="store_true", help="print one frame and leave")
-    command.add_argument(
-        "--web", action="store_true", help="a page on 127.0.0.1 with plots and a stop button"
-    )
+    view = command.add_mutually_exclusive_group()
+    view.add_argument("--once", action="store_true", help="print one frame and leave")
+    view.add_argument("--web", action="store_true", help="a page on 127.0.0.1 with plots and a stop button")
     command.add_argument(
         "--port", type=_port, metavar="N", help="default 8080 for --web, 8765 for --foxglove; 0: any"
     )
-    command.add_argument(
+    view.add_argument(
         "--foxglove", action="store_true", help="serve Foxglove, Lichtblick and PlotJuggler on 127.0.0.1"
     )
 
 
 def _port(text: str) -> int:
-    """A TCP port. Raises ValueError, which argparse turns into a refusal."""
-    port = int(text)
-    if not 0 <= port <= 65535:
-        raise ValueError
-    return port
+    """A TCP port."""
+    with contextlib.suppress(ValueError):
+        if 0 <= (port := int(text)) <= 65535:
+            return port
+    raise argparse.ArgumentTypeError(f"{text!r} must be a port, 0 to 65535")
 
 
 def cmd_watch(args: argparse.Namespace) -> int:

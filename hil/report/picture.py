@@ -68,7 +68,8 @@ def _draw(axis: Any, plot: Plot, runs: Sequence[Run]) -> None:
         axis.set_yticks(range(len(plot.names)), plot.names, fontsize=6)
         axis.set_ylim(-0.5, len(plot.names) - 0.5)
     elif not plot.unit:  # counts: none of them is no reason to look closer
-        axis.set_ylim(0.0, max(1.0, 1.05 * axis.get_ylim()[1]))
+        top = max(1.0, axis.get_ylim()[1])
+        axis.set_ylim(-0.05 * top, 1.05 * top)
     for event in runs[0].events(MOST_EVENTS):
         axis.axvline(
             event["t"],

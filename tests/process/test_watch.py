@@ -115,7 +115,14 @@ def test_another_users_run_is_refused() -> None:
 @pytest.mark.parametrize("port", ["70000", "-1", "x"])
 def test_a_port_that_is_none_is_refused(port: str) -> None:
     done = call("watch", "--web", "--port", port)
-    assert done.returncode == 2 and "--port" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "argument --port: " in done.stderr and "must be a port, 0 to 65535" in done.stderr
+
+
+@pytest.mark.parametrize("flags", [("--web", "--foxglove"), ("--once", "--web"), ("--once", "--foxglove")])
+def test_one_view_at_a_time(flags: tuple[str, ...]) -> None:
+    done = call("watch", *flags)
+    assert done.returncode == 2 and "not allowed with argument" in done.stderr
 
 
 def read_until(fd: int, wanted: bytes, seen: bytes = b"") -> bytes:

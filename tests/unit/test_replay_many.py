@@ -92,7 +92,7 @@ def test_another_observer_what_if(logged: Path, tmp_path: Path) -> None:
     log, again = open_log(logged), open_log(out)
     difference = np.abs(again.ticks["d_hat_w"] - log.ticks["d_hat_w"]).max()
     assert difference == pytest.approx(found.spreads["d_hat_w"].top)
-    with pytest.raises(HilError, match="exists already"):
+    with pytest.raises(HilError, match="exists already; name another file with -o"):
         what_if(logged, CONFIG, load_toml(CONFIG, RunConfig), out)
 
 
