@@ -31,10 +31,10 @@ from drivers.frames import (
     SEND_FAILED,
     SOURCES,
 )
-from drivers.jit import entry
+from drivers.jit import COMPILED, entry
 from drivers.local import CLASSIC, ERR_FLAG, FD
 from drivers.mapping import DriveMap, house_map
-from drivers.port import COMPILED, SocketPort
+from drivers.port import SocketPort
 from drivers.posix import DRAIN_MOST, FLAGS, PENDING, REFUSED_COMMAND, SEEN, SIZE, UNSENT
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of

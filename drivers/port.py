@@ -7,14 +7,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numba.core import config
 
 from drivers.bus import SocketLink
 from drivers.jit import entry
 from drivers.posix import DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, exchange, places_of
 
-COMPILED = not config.DISABLE_JIT  # type: ignore[attr-defined]
-"""The kernels call the C library, which the interpreted form can't."""
 Arrays = dict[str, Any]
 """What :data:`drivers.posix.ARRAYS` names."""
 

@@ -17,11 +17,9 @@ import numba
 import numpy as np
 import numpy.typing as npt
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
 from drivers.frames import FRESH
-from drivers.jit import jit, waiting
+from drivers.jit import array_at, jit, place_of, waiting
 from drivers.states import ENABLE_OPERATION, FAULT_RESET
 from drivers.wire import DATA_AT, FRAME, MESSAGE, REFUSED, SIGNAL, STATE, STATE_RAW, encode, note, take
 
@@ -66,30 +64,9 @@ def places_of(arrays: dict[str, Any]) -> npt.NDArray[np.int64]:
     """Address and length of each array, 0 where there is none; they must outlive it. Raises TypeError."""
     places = np.zeros((len(ARRAYS), 2), np.int64)
     for index, (name, dtype) in enumerate(ARRAYS.items()):
-        if (array := arrays.get(name)) is None:
-            continue
-        if array.dtype != dtype or array.ndim != 1 or not array.flags.c_contiguous:
-            raise TypeError(f"{name}: {array.dtype} of shape {array.shape}; needs a plain row of {dtype}")
-        places[index] = array.ctypes.data, len(array)
+        if (array := arrays.get(name)) is not None:
+            places[index] = place_of(array, dtype)
     return places
-
-
-def _to_pointer(_typing: Any, address: Any) -> Any:
-    """A pointer from its address."""
-
-    def made(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
-        return builder.inttoptr(args[0], cgutils.voidptr_t)
-
-    return _types.voidptr(address), made
-
-
-_behind: Any = intrinsic(_to_pointer)
-
-
-@jit
-def _array(places: Any, index: int, dtype: Any) -> Any:
-    """The array at a place."""
-    return carray(_behind(places[index, 0]), (places[index, 1],), dtype)
 
 
 @jit
@@ -122,10 +99,10 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
     still be read once the time has passed. When it is done the flags are in the tick, at FLAGS_AT, and the
     next call begins anew. Returns DONE, HANDED_BACK or -errno.
     """
-    fds, times, io = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, IO, I8)
-    raw, last, state = _array(places, RAW, U1), _array(places, LAST, I8), _array(places, STATES, STATE)
-    messages, signals = _array(places, MESSAGES, MESSAGE), _array(places, SIGNALS, SIGNAL)
-    words, tick, log = _array(places, WORDS, U4), _array(places, TICK, U1), _array(places, LOG, FRAME)
+    fds, times, io = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, IO, I8)
+    raw, last, state = array_at(places, RAW, U1), array_at(places, LAST, I8), array_at(places, STATES, STATE)
+    messages, signals = array_at(places, MESSAGES, MESSAGE), array_at(places, SIGNALS, SIGNAL)
+    words, tick, log = array_at(places, WORDS, U4), array_at(places, TICK, U1), array_at(places, LOG, FRAME)
     while io[MORE] > 0:
         left_ns = max(deadline_ns - now_ns(times), 0) if deadline_ns > 0 else 0
         if left_ns > 0:
@@ -181,8 +158,8 @@ def exchange(places: Any, size: int, count: int, deadline_ns: int) -> Any:
 
     Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
     """
-    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, SYNC, U1)
-    state, log = _array(places, STATES, STATE), _array(places, LOG, FRAME)
+    fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
+    state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
     if wait(fds, times, 0) != 0:
         return PENDING
     state[0]["got"] = 0
@@ -210,11 +187,11 @@ def gather(values: Any, tick: Any, fields: Any) -> None:
 @jit
 def command(places: Any) -> Any:
     """Lay out and send a tick's command of one message. Returns DONE, REFUSED_COMMAND or -errno."""
-    fds, times, raw = _array(places, FDS, I4), _array(places, TIMES, I8), _array(places, RAW, U1)
-    values, tick, fields = _array(places, VALUES, F8), _array(places, TICK, U1), _array(places, FIELDS, I8)
-    messages, signals = _array(places, MESSAGES, MESSAGE), _array(places, SIGNALS, SIGNAL)
-    state, words = _array(places, STATES, STATE), _array(places, WORDS, U4)
-    log = _array(places, LOG, FRAME)
+    fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, RAW, U1)
+    values, fields = array_at(places, VALUES, F8), array_at(places, FIELDS, I8)
+    messages, signals = array_at(places, MESSAGES, MESSAGE), array_at(places, SIGNALS, SIGNAL)
+    state, words = array_at(places, STATES, STATE), array_at(places, WORDS, U4)
+    tick, log = array_at(places, TICK, U1), array_at(places, LOG, FRAME)
     gather(values, tick, fields)
     size = encode(raw, values, 0, messages, signals, state, words, log, now_ns(times))
     if size == REFUSED:

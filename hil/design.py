@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.config import ChannelTable, LimitsTable, MotorTable, ReferenceTable, RunConfig
-from hil.control.jit import entry
+from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
 from hil.guard import SAFETY_PARAMS
-from hil.kernel import new_safety_state, prepare, step, whole
+from hil.kernel import PLACED, new_safety_state, prepare, step, whole, whole_at
 from hil.signals import TickArray, new_ticks
 
 CYCLIC_ECHO_LAG = 3
@@ -58,10 +58,19 @@ class Machine:
 
     def looped(self) -> Callable[[TickArray], None]:
         """:meth:`prepare` and :meth:`step` as one compiled call, for a loop's tick."""
+        if not COMPILED:
+            return partial(whole, *self._records())
         other = self.fresh()
-        example = (other.reference, other.safety, other.safety_state, other.law, other.law_state, new_ticks())
-        own = (self.reference, self.safety, self.safety_state, self.law, self.law_state)
-        return partial(entry(whole, *example), *own)
+        call = partial(entry(whole_at, other._places(), new_ticks()), self._places())
+        call.__dict__["alive"] = self  # the places are of its records
+        return call
+
+    def _records(self) -> tuple[Record, ...]:
+        return self.reference, self.safety, self.safety_state, self.law, self.law_state
+
+    def _places(self) -> npt.NDArray[np.int64]:
+        rows = zip(self._records(), PLACED, strict=True)
+        return np.array([place_of(record, dtype) for record, dtype in rows], np.int64)
 
     def fresh(self) -> Machine:
         """The same controller before its first tick."""

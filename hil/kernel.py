@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hil.control.jit import jit
-from hil.control.law import FAC, apply, command, observe, reset
-from hil.control.references import reference_at
+from hil.control.jit import array_at, jit
+from hil.control.law import FAC, LAW_PARAMS, LAW_STATE, apply, command, observe, reset
+from hil.control.references import REFERENCE, reference_at
 from hil.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
 from hil.signals import Controlword, DriveState, Reason, RxFlag
 from hil.supervisor import begin_stop, supervise
 
 Record = npt.NDArray[np.void]
+PLACED = (REFERENCE, SAFETY_PARAMS, SAFETY_STATE, LAW_PARAMS, LAW_STATE)
+"""The records of one controller, in the order in which :func:`whole` takes them."""
 
 __all__ = ["SAFETY_PARAMS", "SAFETY_STATE", "new_safety_state", "prepare", "step"]
 
@@ -132,3 +134,11 @@ def whole(rp: Any, sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
     """:func:`prepare` and :func:`step`: a tick of a loop, which has no logged reference to take."""
     prepare(rp, ss, lp, ticks)
     step(sp, ss, lp, ls, ticks)
+
+
+@jit
+def whole_at(places: Any, ticks: Any) -> None:
+    """:func:`whole` over the records at ``places``, in the order of :data:`PLACED`."""
+    safety, state = array_at(places, 1, SAFETY_PARAMS), array_at(places, 2, SAFETY_STATE)
+    law, law_state = array_at(places, 3, LAW_PARAMS), array_at(places, 4, LAW_STATE)
+    whole(array_at(places, 0, REFERENCE), safety, state, law, law_state, ticks)

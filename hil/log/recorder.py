@@ -15,6 +15,7 @@ from typing import IO, Any, Final
 
 from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
+from hil.log.push import pusher
 from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
 from hil.log.split import part_path
@@ -73,6 +74,11 @@ def first_line(stream: IO[bytes], timeout_s: float) -> str:
     return stream.readline().decode(errors="replace").strip()
 
 
+def refuse() -> bool:
+    """The push of a recorder that is closed."""
+    raise LogError("the recorder is closed")
+
+
 class Recorder:
     """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick.
 
@@ -85,7 +91,7 @@ class Recorder:
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
-        self._record, self._record_bytes = new_ticks(), memoryview(b"")
+        self._attach(new_ticks())  # what is compiled for it is there before the loop
         self._failed = self._closed = False
         self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
@@ -151,8 +157,12 @@ class Recorder:
     def tick(self, tick: TickArray) -> None:
         """Store one tick."""
         if tick is not self._record:
-            self._record, self._record_bytes = tick, tick.view("u1").data
-        self._ticks.push(self._record_bytes)
+            self._attach(tick)
+        self._push()
+
+    def _attach(self, record: TickArray) -> None:
+        """Be ready to store this very record."""
+        self._record, self._push = record, pusher(self._ticks, record)
 
     def frames(self, records: memoryview) -> None:
         """Store raw CAN frames, as bytes of :data:`hil.log.schema.FRAME` records."""
@@ -192,5 +202,6 @@ class Recorder:
 
     def _release(self) -> None:
         self._dropped, self._closed = self._ticks.dropped, True
+        self._push = refuse
         for ring in (self._ticks, self._frames, self._events):
             ring.close()

@@ -39,8 +39,8 @@ class Ring:
         access = mmap.PROT_READ if view else mmap.PROT_READ | mmap.PROT_WRITE
         # populated, since the first touch of a page in the loop would cost a fault in the tick that does it
         self._map = mmap.mmap(fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE, prot=access)
-        self._bytes = memoryview(self._map)
-        self.header = self._bytes[:HEADER_BYTES].cast("Q")
+        self.memory = memoryview(self._map)
+        self.header = self.memory[:HEADER_BYTES].cast("Q")
         self.record_size, self.capacity = self.header[SIZE_AT], self.header[CAPACITY_AT]
         if self.header[MAGIC_AT] != MAGIC or HEADER_BYTES + self.record_size * self.capacity != size:
             self.close()
@@ -69,7 +69,7 @@ class Ring:
             header[DROPPED_AT] += 1
             return False
         at = HEADER_BYTES + (head % self.capacity) * self.record_size
-        self._bytes[at : at + self.record_size] = record
+        self.memory[at : at + self.record_size] = record
         header[HEAD_AT] = head + 1
         return True
 
@@ -84,9 +84,9 @@ class Ring:
         first = head % self.capacity
         at, end = HEADER_BYTES + first * size, count * size
         cut = min(end, (self.capacity - first) * size)
-        self._bytes[at : at + cut] = records[:cut]
+        self.memory[at : at + cut] = records[:cut]
         if cut < end:
-            self._bytes[HEADER_BYTES : HEADER_BYTES + end - cut] = records[cut:end]
+            self.memory[HEADER_BYTES : HEADER_BYTES + end - cut] = records[cut:end]
         header[HEAD_AT] = head + count
 
     def take(self, *, final: bool = False) -> bytes:
@@ -119,9 +119,9 @@ class Ring:
         size, base = self.record_size, HEADER_BYTES
         first, count = start % self.capacity, end - start
         whole = min(count, self.capacity - first)
-        out = bytes(self._bytes[base + first * size : base + (first + whole) * size])
+        out = bytes(self.memory[base + first * size : base + (first + whole) * size])
         if whole < count:
-            out += bytes(self._bytes[base : base + (count - whole) * size])
+            out += bytes(self.memory[base : base + (count - whole) * size])
         return out
 
     @property
@@ -142,7 +142,7 @@ class Ring:
     def close(self) -> None:
         """Unmap and close."""
         self.header.release()
-        self._bytes.release()
+        self.memory.release()
         self._map.close()
         os.close(self.fd)
 
