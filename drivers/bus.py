@@ -95,7 +95,7 @@ class SocketLink:
         """Send a data frame."""
         if fd and not self._fd:
             raise LinkError(
-                errno.EINVAL, "can't send a CAN FD frame: the bus is opened without fd; set bus.fd"
+                errno.EINVAL, "can't send a CAN FD frame: the bus is opened without fd; set bus.fd, or --fd"
             )
         try:
             self._write(pack_frame(can_id, data, fd))

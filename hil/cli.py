@@ -51,8 +51,13 @@ def main(argv: list[str] | None = None) -> int:
     except Exception as error:
         if not _is_refusal(error):
             raise
-        say("\n".join(f"hil: {line}" for line in str(error).splitlines()))
+        say("\n".join(f"hil: {line}" for line in _words(error).splitlines()))
         return EXIT_REFUSED
+
+
+def _words(error: Exception) -> str:
+    """What an error says; of the system's errors without their number."""
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def _is_refusal(error: Exception) -> bool:

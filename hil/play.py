@@ -114,7 +114,7 @@ class Source:
             raise LogError(f"{path}: no such file")
         self.path = path
         self.damage: str | None = None
-        self._ours = path.suffix == ".mcap"
+        self._ours = path.suffix.lower() == ".mcap"
         self.roles_known, self._own_ids = self._roles() if self._ours else (False, frozenset())
 
     def _roles(self) -> tuple[bool, frozenset[int]]:

@@ -212,13 +212,26 @@ def heard(bus: can.BusABC, count: int) -> list[tuple[int, bytes]]:
 WANTED = [(int(f["can_id"]), bytes(f["data"][: f["size"]])) for f in FRAMES]
 
 
-@pytest.mark.parametrize("ending", [".mcap", ".log", ".asc", ".blf"])
+def test_long_frames_need_fd_and_the_refusal_says_so(tmp_path: Path, channel: str, capsys: Any) -> None:
+    frames = FRAMES.copy()
+    frames["size"] = 64
+    write_log(tmp_path / "run.mcap", some_ticks(100), frames)
+    words = ["play", str(tmp_path / "run.mcap"), "-i", "hil-local", "-c", channel, "--rate", "5"]
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("hil: can't send a CAN FD frame") and "--fd" in error and "Errno" not in error
+    with can.Bus(interface="hil-local", channel=channel, fd=True) as bus:
+        assert main([*words, "--fd"]) == 0
+        assert [len(data) for _, data in heard(bus, 100)] == [64] * 100
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".log", ".asc", ".blf", ".mf4"])
 def test_python_can_hears_every_frame_of_a_log_and_of_its_exports(
     path: Path, channel: str, ending: str, capsys: Any
 ) -> None:
     source = path.with_suffix(ending)
     if ending != ".mcap":
-        export(path, source)
+        export(path, source, frames=True)
     with can.Bus(interface="hil-local", channel=channel) as bus:
         flags = ["-i", "hil-local", "-c", channel, "--direction", "both", "--rate", "5", "--json"]
         assert main(["play", str(source), *flags]) == 0
