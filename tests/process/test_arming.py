@@ -31,8 +31,11 @@ Settings = Callable[..., tuple[str, ...]]
 COMMAND = 0x201
 
 
-def talk(words: list[str], answer: bytes, timeout_s: float = 60.0) -> tuple[int, str]:
-    """Run hil on a terminal of its own, type ``answer`` at the question; exit code and what was shown."""
+def talk(words: list[str], answer: bytes, timeout_s: float = 180.0) -> tuple[int, str]:
+    """Run hil on a terminal of its own, type ``answer`` at the question; exit code and what was shown.
+
+    The time holds the compilation of kernels after a change of the sources.
+    """
     own, its = pty.openpty()
     process = subprocess.Popen([sys.executable, "-m", "hil.cli", *words], stdin=its, stdout=its, stderr=its)
     os.close(its)
