@@ -9,6 +9,7 @@ wire.
 from __future__ import annotations
 
 import argparse
+import compileall
 import hashlib
 import json
 import os
@@ -193,6 +194,12 @@ def kernels() -> Path:
     return folder_of(ROOT)
 
 
+def compile_sources() -> None:
+    """Leave byte code beside the sources: the machine can not write it, and would compile in each run."""
+    for package in ("hil", "drivers", "firmware_model", "tests/vm"):
+        compileall.compile_dir(ROOT / package, quiet=2)
+
+
 def warm_kernels() -> None:
     """Compile on the host what the machine will run, once for a tree: compiling there takes minutes."""
     folder = kernels()
@@ -238,6 +245,7 @@ def run_in_machine(
     `python FILE` and `python -m MODULE` begin with the packages imported.
     """
     kernel, image = prepare()
+    compile_sources()
     folder = out or Path(tempfile.mkdtemp(prefix="hil-machine-"))
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("stdout", "stderr", "code"):
