@@ -172,7 +172,7 @@ def _job(command: Sequence[str]) -> str:
         "OPENBLAS_NUM_THREADS": "1",
     }
     setup = f"""\
-mkdir /dev/shm/numba && cp -r {shlex.quote(str(kernels()))} /dev/shm/numba
+mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels()))} /dev/shm/numba
 echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up

@@ -72,22 +72,26 @@ class Forked:
 
 
 def warm_up() -> None:
-    """Import everything and load the compiled kernels once, before any process is forked."""
+    """Import what a run needs and load its compiled kernels once, before any process is forked."""
     from drivers.client import precompile
     from hil.app import Overrides, load_setup
-    from hil.bench.pieces import guard_ns
     from hil.signals import new_ticks
-    from hil.simulate import simulate_ticks
 
-    setup = load_setup(Path(CONFIG), Overrides(settings=("loop.duration_s=0.05",)))
-    simulate_ticks(setup)
-    guard_ns(setup.machine, 1)
+    setup = load_setup(Path(CONFIG), Overrides())
     node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
     node[0].warm_up()
     node[1].close()
     precompile(setup.database, setup.binding.map, False, new_ticks()[0])
     setup.machine.looped()
     read_in()
+
+
+def compile_the_rest() -> None:
+    """On the host: kernels that single jobs need, so that the machine finds them compiled."""
+    from hil.app import Overrides, load_setup
+    from hil.bench.pieces import guard_ns
+
+    guard_ns(load_setup(Path(CONFIG), Overrides()).machine, 1)
 
 
 def read_in() -> None:
@@ -103,3 +107,4 @@ def read_in() -> None:
 
 if __name__ == "__main__":
     warm_up()
+    compile_the_rest()
