@@ -10,7 +10,7 @@ from typing import Any
 from drivers.bus import Frame
 from drivers.codec import Database, Message
 from firmware_model.config import Wire
-from firmware_model.drive import on_command, on_load_command
+from firmware_model.kernels import Kernels
 
 PROTOCOL_VERSION = 1
 VOLTAGE_MODE = 0
@@ -59,14 +59,14 @@ class HouseFrames:
         """The heartbeat: operational."""
         return [(self._heartbeat_id, b"\x05", False)]
 
-    def take(self, frame: Frame, state: Any, catch_up: Callable[[], None]) -> None:
+    def take(self, frame: Frame, drive: Kernels, catch_up: Callable[[], None]) -> None:
         """Take a command, whole or not at all; ``catch_up`` brings the plant to now first."""
         if frame.flags:
             self.ignored["flags"] += 1
         elif frame.can_id == self._command.can_id:
-            self._on_command(frame.data, state, catch_up)
+            self._on_command(frame.data, drive, catch_up)
         elif self._load and frame.can_id == self._load.can_id:
-            self._on_load(frame.data, state)
+            self._on_load(frame.data, drive)
 
     def _acceptable(self, message: Message, data: bytes) -> bool:
         if len(data) != message.length:
@@ -77,7 +77,7 @@ class HouseFrames:
             return False
         return True
 
-    def _on_command(self, data: bytes, state: Any, catch_up: Callable[[], None]) -> None:
+    def _on_command(self, data: bytes, drive: Kernels, catch_up: Callable[[], None]) -> None:
         if not self._acceptable(self._command, data):
             return
         counter, controlword, u_q, u_d = self._read_command(data)
@@ -91,10 +91,10 @@ class HouseFrames:
         catch_up()
         if self._read_inline:
             enable, T_L = self._read_inline(data)
-            on_load_command(state, T_L if enable else 0.0)
-        on_command(state, int(counter), int(controlword), u_q, u_d)
+            drive.load(T_L if enable else 0.0)
+        drive.command(int(counter), int(controlword), u_q, u_d)
 
-    def _on_load(self, data: bytes, state: Any) -> None:
+    def _on_load(self, data: bytes, drive: Kernels) -> None:
         assert self._load is not None and self._read_load is not None  # noqa: S101 - set together
         if not self._acceptable(self._load, data):
             return
@@ -103,9 +103,9 @@ class HouseFrames:
             self.ignored["repeated"] += 1
             return
         self._last_load = int(counter)
-        on_load_command(state, T_L if enable else 0.0)
+        drive.load(T_L if enable else 0.0)
 
-    def answer(self, out: Any) -> list[Sent]:
+    def answer(self, out: dict[str, Any]) -> list[Sent]:
         """EMCY if a fault arose, TRUTH, STATUS when due, FEEDBACK last."""
         frames: list[Sent] = []
         if out["emcy_due"]:

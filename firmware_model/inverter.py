@@ -15,8 +15,8 @@ from typing import Any, Final
 
 from drivers.bus import Frame
 from firmware_model.config import Wire
-from firmware_model.drive import on_command
 from firmware_model.house import Sent
+from firmware_model.kernels import Kernels
 from firmware_model.plant import State
 
 EXTENDED: Final = 0x80000000
@@ -61,7 +61,7 @@ class InverterFrames:
         """It has no heartbeat."""
         return []
 
-    def take(self, frame: Frame, state: Any, catch_up: Callable[[], None]) -> None:
+    def take(self, frame: Frame, drive: Kernels, catch_up: Callable[[], None]) -> None:
         """Take a demand, whole or not at all."""
         if frame.can_id | frame.flags != DEMAND_ID:
             return
@@ -78,9 +78,9 @@ class InverterFrames:
         self._last = alive
         catch_up()
         u_q, u_d = (int.from_bytes(frame.data[at : at + 3], "big", signed=True) * VOLT_LSB for at in (0, 3))
-        on_command(state, alive, controlword(state, bool(bits & 0x80), bool(bits & 0x40)), u_q, u_d)
+        drive.command(alive, controlword(drive.state, bool(bits & 0x80), bool(bits & 0x40)), u_q, u_d)
 
-    def answer(self, out: Any) -> list[Sent]:
+    def answer(self, out: dict[str, Any]) -> list[Sent]:
         """Supply when due, the true values, motor state last."""
         frames: list[Sent] = []
         if out["status_due"]:

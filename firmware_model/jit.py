@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from drivers.jit import cache_folder, jit
+from drivers.jit import COMPILED, array_at, cache_folder, entry, jit, place_of
 
-__all__ = ["cache_folder", "jit"]
+__all__ = ["COMPILED", "array_at", "cache_folder", "entry", "jit", "place_of"]

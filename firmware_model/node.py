@@ -21,10 +21,11 @@ from drivers.bus import Frame, Link
 from drivers.codec import Database
 from drivers.errors import LinkError
 from firmware_model.config import Record, Wire, new_sample, new_state
-from firmware_model.drive import advance, on_command, on_load_command, on_sync
+from firmware_model.drive import advance
 from firmware_model.faulty_plant import PlantFaults, advance_open_phase
 from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
+from firmware_model.kernels import Kernels
 from firmware_model.plant import State
 
 Frames = HouseFrames | InverterFrames
@@ -48,12 +49,10 @@ def wire_of(database: Database, protocol: Protocol = "house") -> Wire:
 
 def compile_kernels(params: Record, state: Record, *, faults: bool) -> None:
     """Run every kernel of a plant once, those of faults too; ``state`` is spoiled."""
-    advance(params[0], state[0], 1000)
+    Kernels(params, state, new_sample())
     if faults:
+        advance(params[0], state[0], 1000)
         advance_open_phase(params[0], state[0], np.zeros(1), 1000)
-    on_command(state[0], 0, 0, 0.0, 0.0)
-    on_load_command(state[0], 0.0)
-    on_sync(params[0], state[0], new_sample()[0])
 
 
 class Node:
@@ -77,7 +76,7 @@ class Node:
         self._frames, self._faults = self._make_frames(), faults
         self._params = params
         self._state = new_state(params, self._frames.counter_modulus - 1)
-        self._sample = new_sample()
+        self._kernels = Kernels(params, self._state, new_sample())
         self._last_ns = 0
         self._started = False
 
@@ -94,7 +93,7 @@ class Node:
     @property
     def state(self) -> Any:
         """The plant's state record."""
-        return self._state[0]
+        return self._kernels.state
 
     def warm_up(self) -> None:
         """Compile the kernels on copies, before anything is on the bus."""
@@ -152,7 +151,7 @@ class Node:
     def _advance(self, dt_ns: int) -> None:
         """Move the plant on; a drive whose supply came back boots."""
         if self._faults is None:
-            advance(self._params[0], self.state, dt_ns)
+            self._kernels.advance(dt_ns)
             return
         self._faults.advance(self.state, dt_ns)
         if self._faults.before(self.state):
@@ -167,7 +166,7 @@ class Node:
     def take(self, frame: Frame) -> None:
         """Handle one frame, whole or not at all."""
         if frame.can_id | frame.flags != self._frames.sync_id:
-            self._frames.take(frame, self.state, self._on_command)
+            self._frames.take(frame, self._kernels, self._on_command)
         elif self._pacing == "sync":
             if len(frame.data) > 1:  # CANopen: no data or the counter
                 self.ignored["length"] += 1
@@ -183,10 +182,11 @@ class Node:
             self._advance(self._period_ns)
         else:
             self._advance_to(now_ns)
-        on_sync(self._params[0], self.state, self._sample[0])
+        kernels = self._kernels
+        kernels.sync()
         if self._faults is not None:
-            self._faults.after(self.state, self._sample[0])
-        self._send(self._frames.answer(self._sample[0]))
+            self._faults.after(kernels.state, kernels.sample)
+        self._send(self._frames.answer(kernels.sampled()))
 
     def _send(self, frames: list[Sent]) -> None:
         """A drive does not stop for a bus that is down; its watchdog does."""

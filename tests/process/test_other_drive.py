@@ -15,8 +15,9 @@ import pytest
 from drivers.bus import Frame
 from drivers.codec import Database
 from drivers.errors import DatabaseError
-from firmware_model.config import PlantConfig, build_params, new_state
+from firmware_model.config import PlantConfig, build_params, new_sample, new_state
 from firmware_model.inverter import InverterFrames, int24
+from firmware_model.kernels import Kernels
 from firmware_model.plant import State
 from hil.app import Overrides, check_load, load_setup, run
 from hil.config import load_toml
@@ -160,7 +161,8 @@ def test_bytes_by_hand() -> None:
     """u_q 100 V = 100000 = 0x0186A0, u_d -1 V = 0xFFFC18, on, key 90, alive 5."""
     plant = load_toml(CONFIGS / "plants" / NAME, PlantConfig, [])
     frames = InverterFrames(truth=False)
-    state = new_state(build_params(plant, frames.wire), 15)[0]
+    params = build_params(plant, frames.wire)
+    drive = Kernels(params, new_state(params, 15), new_sample())
     good = bytes.fromhex("0186A0 FFFC18 80 5A 50 000000")
     command = Database(CONFIGS / "drives" / "inverter_fd.dbc", 1).message("Demand")
     values = {"Uq": 100.0, "Ud": -1.0, "On": 1, "ClearFault": 0, "Key": 90, "Alive": 5}
@@ -170,13 +172,13 @@ def test_bytes_by_hand() -> None:
         "key": demand(good[:7] + b"\x5b" + good[8:]),
     }
     for name, frame in refused.items():
-        frames.take(frame, state, lambda: None)
+        frames.take(frame, drive, lambda: None)
         assert frames.ignored == {name: 1}, name
         frames.ignored.clear()
     fed: list[int] = []
-    frames.take(demand(good), state, lambda: fed.append(1))
-    frames.take(demand(good), state, lambda: fed.append(1))  # stale: the same alive counter
-    frames.take(demand(good, 0x98FF1101), state, lambda: fed.append(1))
+    frames.take(demand(good), drive, lambda: fed.append(1))
+    frames.take(demand(good), drive, lambda: fed.append(1))  # stale: the same alive counter
+    frames.take(demand(good, 0x98FF1101), drive, lambda: fed.append(1))
     assert fed == [1] and frames.ignored == {"repeated": 1}
-    assert state["state"] == State.SWITCH_ON_DISABLED
+    assert drive.state["state"] == State.SWITCH_ON_DISABLED
     assert (int24(1e9), int24(-1.0)) == (b"\x7f\xff\xff", b"\xff\xff\xff")

@@ -1,0 +1,79 @@
+"""The kernels of a tick over one drive's records, ready to be called.
+
+To unpack a record costs more than what most of them do, so each takes one array of the records' places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from firmware_model.config import Record
+from firmware_model.drive import advance, on_command, on_load_command, on_sync
+from firmware_model.jit import COMPILED, array_at, entry, jit, place_of
+from firmware_model.plant import PARAMS, SAMPLE, STATE
+
+
+class Kernels:
+    """``advance(dt_ns)``, ``sync()``, ``command(counter, controlword, u_q, u_d)`` and ``load(T_L)``.
+
+    They work on the records that were given, in place; ``state`` and ``sample`` are views of those.
+    """
+
+    advance: Callable[[int], None]
+    sync: Callable[[], None]
+    command: Callable[[int, int, float, float], None]
+    load: Callable[[float], None]
+
+    def __init__(self, params: Record, state: Record, sample: Record) -> None:
+        self._alive = params, state, sample
+        self.state: Any = state[0]
+        self.sample: Any = sample[0]
+        if not COMPILED:
+            self.advance = partial(advance, params[0], self.state)
+            self.sync = partial(on_sync, params[0], self.state, self.sample)
+            self.command, self.load = partial(on_command, self.state), partial(on_load_command, self.state)
+            return
+        copies = params, state.copy(), sample.copy()
+        trial, places = places_of(*copies), places_of(*self._alive)
+        self.advance = partial(entry(advance_at, trial, 0), places)
+        self.sync = partial(entry(on_sync_at, trial), places)
+        self.command = partial(entry(on_command_at, trial, 0, 0, 0.0, 0.0), places)
+        self.load = partial(entry(on_load_command_at, trial, 0.0), places)
+
+    def sampled(self) -> dict[str, Any]:
+        """The sample as plain numbers."""
+        return dict(zip(SAMPLE.names or (), self.sample.item(), strict=True))
+
+
+def places_of(params: Record, state: Record, sample: Record) -> npt.NDArray[np.int64]:
+    """Where the records are, which must outlive the use."""
+    return np.array([place_of(params, PARAMS), place_of(state, STATE), place_of(sample, SAMPLE)], np.int64)
+
+
+@jit
+def advance_at(places: Any, dt_ns: int) -> None:
+    """:func:`firmware_model.drive.advance`."""
+    advance(array_at(places, 0, PARAMS)[0], array_at(places, 1, STATE)[0], dt_ns)
+
+
+@jit
+def on_sync_at(places: Any) -> None:
+    """:func:`firmware_model.drive.on_sync`."""
+    on_sync(array_at(places, 0, PARAMS)[0], array_at(places, 1, STATE)[0], array_at(places, 2, SAMPLE)[0])
+
+
+@jit
+def on_command_at(places: Any, counter: int, controlword: int, u_q: float, u_d: float) -> None:
+    """:func:`firmware_model.drive.on_command`."""
+    on_command(array_at(places, 1, STATE)[0], counter, controlword, u_q, u_d)
+
+
+@jit
+def on_load_command_at(places: Any, T_L: float) -> None:
+    """:func:`firmware_model.drive.on_load_command`."""
+    on_load_command(array_at(places, 1, STATE)[0], T_L)
