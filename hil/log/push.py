@@ -11,10 +11,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.control.jit import COMPILED, array_at, entry, jit, place_of
+from hil.control.jit import COMPILED, array_at, entry, jit, numba_types, place_of
 from hil.log.ring import CAPACITY_AT, DROPPED_AT, HEAD_AT, HEADER_BYTES, HIGH_AT, TAIL_AT, Ring, RingError
 from hil.signals import TickArray
 
+HEADER, MEMORY, RECORD = range(3)
+ADDRESS, LENGTH = range(2)
+_word = numba_types.uintp
+_memcpy = numba_types.ExternalFunction("memcpy", _word(_word, _word, _word))
 I8, U1 = np.dtype(np.int64), np.dtype(np.uint8)
 NOWHERE: Final = (
     (np.zeros(HIGH_AT + 1, np.int64), I8),
@@ -46,12 +50,12 @@ def _seen(memory: memoryview, dtype: Any) -> tuple[int, int]:
 @jit
 def push(places: Any) -> Any:
     """Store the record, then publish it by the head; a full ring drops it and counts it."""
-    header, memory, record = array_at(places, 0, I8), array_at(places, 1, U1), array_at(places, 2, U1)
+    header, size = array_at(places, HEADER, I8), places[RECORD, LENGTH]
     head, capacity = header[HEAD_AT], header[CAPACITY_AT]
     if head - header[TAIL_AT] >= capacity:
         header[DROPPED_AT] += 1
         return False
-    at = HEADER_BYTES + head % capacity * len(record)
-    memory[at : at + len(record)] = record
+    at = HEADER_BYTES + head % capacity * size
+    _memcpy(places[MEMORY, ADDRESS] + at, places[RECORD, ADDRESS], size)
     header[HEAD_AT] = head + 1
     return True
