@@ -86,8 +86,7 @@ class GuardedDrive:
             self.receive(tick, deadline_ns)
             return
         self._drive.exchange(tick, deadline_ns)
-        if words[FIRED] or words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS:
-            self._note_guardian()
+        self._note_guardian()
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Feedback, and what the guardian did."""
