@@ -13,9 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs"
 
-if (
-    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
-):  # started in the background of a script: programs inherit it
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a script: programs inherit it
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
