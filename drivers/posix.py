@@ -91,6 +91,13 @@ def wait(fds: Any, times: Any, left_ns: int) -> Any:
     return -errno() if ready < 0 else ready
 
 
+@jit
+def receive(fds: Any, raw: Any) -> Any:
+    """Read what is there into ``raw``: its size, or -errno, -EAGAIN when there is nothing."""
+    size = _recv(fds[RECEIVING], raw.ctypes.data, len(raw), DONTWAIT)
+    return -errno() if size < 0 else size
+
+
 @waiting
 def drain(places: Any, deadline_ns: int, late: bool) -> Any:
     """Take frames until feedback came or the deadline passed; deadline 0: what is there.
@@ -113,13 +120,12 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
                 return ready
         else:
             io[MORE] -= 1
-        size = _recv(fds[RECEIVING], raw.ctypes.data, len(raw), DONTWAIT)
+        size = receive(fds, raw)
         if size < 0:
-            code = errno()
-            if code == EINTR or (code == EAGAIN and left_ns > 0):
+            if size == -EINTR or (size == -EAGAIN and left_ns > 0):
                 continue
-            if code != EAGAIN:
-                return -code
+            if size != -EAGAIN:
+                return size
             break
         seen = take(raw, messages, signals, last, state, words, tick, log, size, late, now_ns(times))
         if seen < 0 or seen >= STATE_RAW or state[0]["logged"] >= len(log) - 1 > 0:

@@ -175,13 +175,19 @@ def put(tick: Any, g: Any, value: float) -> None:
 
 
 @jit
+def identifier(raw: Any) -> int:
+    """Identifier of a frame with SocketCAN's flag bits."""
+    return int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
+
+
+@jit
 def note(log: Any, s: Any, raw: Any, received: int, t_ns: int) -> None:
     """Write a frame to the next place of the log, which counts once ``logged`` goes on; none when full."""
     if s["logged"] >= len(log):
         return
     entry = log[s["logged"]]
     entry["t_ns"], entry["received"], entry["size"] = t_ns, received, min(int(raw[4]), 64)
-    entry["can_id"] = int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
+    entry["can_id"] = identifier(raw)
     for index in range(min(int(raw[4]), 64)):
         entry["data"][index] = raw[DATA_AT + index]
 
@@ -196,7 +202,7 @@ def note_sent(log: Any, state: Any, raw: Any, t_ns: int) -> int:
 @jit
 def find(raw: Any, messages: Any) -> int:
     """Place of a frame's message by its identifier, -1 for none."""
-    can_id = int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
+    can_id = identifier(raw)
     for index in range(len(messages)):
         if messages[index]["id"] == can_id:
             return index

@@ -16,7 +16,7 @@ import numpy as np
 from firmware_model.jit import jit
 from firmware_model.load import edge_after, load_torque
 from firmware_model.motor import move
-from firmware_model.plant import ErrorCode, State
+from firmware_model.plant import PROTOCOL_VERSION, ErrorCode, State
 from firmware_model.sensors import measure, whole_degrees
 
 
@@ -169,6 +169,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     out["i_q"] = measure(s, x[1], p["i_noise"], p["i_q_lsb"], p["i_q_top"])
     out["i_d"] = measure(s, x[2], p["i_noise"], p["i_d_lsb"], p["i_d_top"])
     out["echo"], out["state"], out["limited"] = s["echo"], s["state"], s["limited"]
+    out["protocol_version"] = PROTOCOL_VERSION
     out["v_dc"] = min(np.rint(p["v_dc"] / 0.1), 65535.0) * 0.1
     out["temperature_motor"] = whole_degrees(s["temperature"])
     out["temperature_inverter"] = whole_degrees(p["ambient"])

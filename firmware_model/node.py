@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from drivers.bus import Frame, Link
+from drivers.bus import Frame, Link, unpack_frame
 from drivers.codec import Database
 from drivers.errors import LinkError
 from firmware_model.config import Record, Wire, new_sample, new_state
@@ -27,12 +27,12 @@ from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.kernels import Kernels
 from firmware_model.plant import State
+from firmware_model.station import ANSWER, IDLE_NS, LAST_NS, STARTED, UNSENT, Station, station
 
 Frames = HouseFrames | InverterFrames
 
 BLACK_BOX = "black box: "
 HEARTBEAT_NS = 100_000_000
-IDLE_NS = 5_000_000
 RUN_OUT_NS = 500_000_000
 Protocol = Literal["house", "inverter"]
 
@@ -47,12 +47,11 @@ def wire_of(database: Database, protocol: Protocol = "house") -> Wire:
     return frames_of(database, protocol).wire
 
 
-def compile_kernels(params: Record, state: Record, *, faults: bool) -> None:
+def compile_kernels(params: Record, state: Record) -> None:
     """Run every kernel of a plant once, those of faults too; ``state`` is spoiled."""
     Kernels(params, state, new_sample())
-    if faults:
-        advance(params[0], state[0], 1000)
-        advance_open_phase(params[0], state[0], np.zeros(1), 1000)
+    advance(params[0], state[0], 1000)
+    advance_open_phase(params[0], state[0], np.zeros(1), 1000)
 
 
 class Node:
@@ -76,9 +75,12 @@ class Node:
         self._frames, self._faults = self._make_frames(), faults
         self._params = params
         self._state = new_state(params, self._frames.counter_modulus - 1)
-        self._kernels = Kernels(params, self._state, new_sample())
-        self._last_ns = 0
-        self._started = False
+        records = params, self._state, new_sample()
+        self._kernels = Kernels(*records)
+        self._station: Station | None = None
+        if pacing == "sync" and faults is None:
+            self._station = station(link, self._frames, records, period_ns if clock == "lockstep" else 0)
+        self._cells: Any = (self._station.cells if self._station else np.zeros(UNSENT + 1, np.int64)).data
 
     @property
     def ignored(self) -> Counter[str]:
@@ -96,13 +98,14 @@ class Node:
         return self._kernels.state
 
     def warm_up(self) -> None:
-        """Compile the kernels on copies, before anything is on the bus."""
-        compile_kernels(self._params, self._state.copy(), faults=self._faults is not None)
+        """Compile on copies, before anything is on the bus, what the node was not made with."""
+        if self._faults is not None:
+            compile_kernels(self._params, self._state.copy())
 
     def run(self, stopped: Callable[[], bool]) -> None:
         """Serve the bus until ``stopped()``; boot-up message first, heartbeat every 100 ms."""
         self._send(self._frames.boot())
-        self._last_ns = next_beat = next_cycle = time.monotonic_ns()
+        self._cells[LAST_NS] = next_beat = next_cycle = time.monotonic_ns()
         while not stopped():
             now = time.monotonic_ns()
             if now >= next_beat:
@@ -112,7 +115,10 @@ class Node:
                 next_cycle += self._period_ns * (1 + (now - next_cycle) // self._period_ns)
                 self.sync(now)
             wake = min(next_beat, next_cycle) if self._pacing == "cyclic" else next_beat
-            self._serve(min(max(wake - now, 0), IDLE_NS))
+            if self._station is None:
+                self._serve(min(max(wake - now, 0), IDLE_NS))
+            else:
+                self._attend(self._station, wake)
         self._run_out()
 
     def _run_out(self) -> None:
@@ -124,29 +130,50 @@ class Node:
 
     def _serve(self, timeout_ns: int) -> None:
         try:
-            frame = self._link.receive(timeout_ns)
+            self._after(self._link.receive(timeout_ns))
         except LinkError:
-            time.sleep(0.01)
-            frame = None
+            self._bus_down()
+
+    def _attend(self, station: Station, until_ns: int) -> None:
+        """:meth:`_serve` over many frames in one call; what that does not judge is taken here."""
+        code = station.attend(until_ns)
+        if self._cells[UNSENT]:
+            self.ignored["send"] += self._cells[UNSENT]
+            self._cells[UNSENT] = 0
+        if code == ANSWER:
+            self._send(self._frames.answer(self._kernels.sampled()))
+        elif code < 0:
+            self._bus_down()
+        else:
+            self._after(unpack_frame(bytes(station.raw[:code])))
+
+    def _after(self, frame: Frame | None) -> None:
+        """Take a frame, if there is one, else the time that has passed."""
         if frame is not None:
             self.take(frame)
-        if frame is None or time.monotonic_ns() - self._last_ns > IDLE_NS:  # a flood must not stop the plant
+        if (
+            frame is None or time.monotonic_ns() - self._cells[LAST_NS] > IDLE_NS
+        ):  # a flood must not stop the plant
             self._catch_up()
+
+    def _bus_down(self) -> None:
+        time.sleep(0.01)
+        self._catch_up()
 
     def _catch_up(self) -> None:
         """Realtime: let the plant catch up with the clock, once its time has begun."""
-        if self._clock == "realtime" and self._started:
+        if self._clock == "realtime" and self._cells[STARTED]:
             self._advance_to(time.monotonic_ns())
 
     def _on_command(self) -> None:
         """Before a valid command is taken; a cyclic drive's plant stands still until its first."""
-        if not self._started and self._pacing == "cyclic":
-            self._started, self._last_ns = True, time.monotonic_ns()
+        if not self._cells[STARTED] and self._pacing == "cyclic":
+            self._cells[STARTED], self._cells[LAST_NS] = 1, time.monotonic_ns()
         self._catch_up()
 
     def _advance_to(self, now_ns: int) -> None:
-        self._advance(now_ns - self._last_ns)
-        self._last_ns = now_ns
+        self._advance(now_ns - self._cells[LAST_NS])
+        self._cells[LAST_NS] = now_ns
 
     def _advance(self, dt_ns: int) -> None:
         """Move the plant on; a drive whose supply came back boots."""
@@ -160,7 +187,7 @@ class Node:
 
     def pass_time(self) -> None:
         """Lockstep: a period has passed although its SYNC was lost."""
-        if self._started and self._clock == "lockstep":
+        if self._cells[STARTED] and self._clock == "lockstep":
             self._advance(self._period_ns)
 
     def take(self, frame: Frame) -> None:
@@ -175,9 +202,9 @@ class Node:
 
     def sync(self, now_ns: int) -> None:
         """One SYNC (or cycle): advance, latch, sample, answer."""
-        if not self._started:
-            self._started = self._pacing == "sync"
-            self._last_ns = now_ns
+        if not self._cells[STARTED]:
+            self._cells[STARTED] = self._pacing == "sync"
+            self._cells[LAST_NS] = now_ns
         elif self._clock == "lockstep":
             self._advance(self._period_ns)
         else:

@@ -13,6 +13,7 @@ import numpy as np
 MAX_LOADS: Final = 8
 ORDER: Final = 8
 """Order of the motor's Taylor series."""
+PROTOCOL_VERSION: Final = 1
 
 
 class State(IntEnum):
@@ -140,6 +141,7 @@ SAMPLE: Final = np.dtype(
         ("echo", "i8"),
         ("state", "i8"),
         ("limited", "i8"),
+        ("protocol_version", "i8"),
         ("v_dc", "f8"),
         ("temperature_motor", "f8"),
         ("temperature_inverter", "f8"),

@@ -60,7 +60,7 @@ def warm_up(path: Path, config: RunConfig) -> None:
     """Compile the plant's kernels and those of its faults, for the processes forked from this one."""
     plant, folder = load_plant(path, config)
     params = build_params(plant, wire_of(Database(folder / plant.dbc, plant.node_id), plant.protocol))
-    compile_kernels(params, new_state(params, 0), faults=True)
+    compile_kernels(params, new_state(params, 0))
 
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:

@@ -256,7 +256,6 @@ def test_random_frames_never_move_the_drive_and_never_stop_it(configs: Path) -> 
 def test_a_flood_does_not_keep_the_watchdog_from_tripping(configs: Path) -> None:
     bench = Bench(configs, clock="realtime")
     bench.node.warm_up()
-    bench.node._last_ns = time.monotonic_ns()
     bench.sync()
     bench.command(0x06)
 

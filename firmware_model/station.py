@@ -1,0 +1,270 @@
+"""The drive's place on a bus as one compiled call: SYNC and commands of the house protocol, frame by frame.
+
+:func:`attend` waits, and takes what is whole, valid and fresh: a SYNC moves the plant on and is answered at
+once, a command waits for the next SYNC. So it goes on until its time is over. Everything else (a frame that
+is damaged, repeated or of another identifier, an EMCY to be sent) it hands back untouched to the caller, who
+has the same rules in :mod:`firmware_model.house`; equality of the two is tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from drivers.binding import Bound
+from drivers.bus import Link, SocketLink
+from drivers.codec import Message
+from drivers.jit import waiting
+from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, transmit, wait
+from drivers.tables import Tables, laid_out
+from drivers.wire import (
+    CLASSIC_BYTES,
+    DATA_AT,
+    FD_BYTES,
+    FRAME,
+    MESSAGE,
+    REFUSED,
+    SIGNAL,
+    encode,
+    find,
+    identifier,
+    is_valid,
+    phys_of,
+)
+from drivers.wire import STATE as WIRE_STATE
+from firmware_model.config import Record
+from firmware_model.drive import advance, on_command, on_load_command, on_sync
+from firmware_model.house import FIRST_ANSWER, VOLTAGE_MODE, HouseFrames
+from firmware_model.jit import COMPILED, array_at, entry, jit, place_of
+from firmware_model.plant import PARAMS, SAMPLE, STATE
+
+IDLE_NS: Final = 5_000_000
+"""So long without a frame is silence, in which the caller lets the plant catch up."""
+ANSWER: Final = 1
+"""What :func:`attend` returns when a SYNC was taken and the caller is to send what it is answered with; 0:
+the time is over, or it was silent. Sizes of frames are more than both."""
+LAST_NS, STARTED, UNSENT, SYNC_ID, PERIOD_NS = range(5)
+"""Cells: when the plant was moved last, whether its time has begun, answers that the bus did not take; of the
+configuration, the identifier of SYNC and the period of lockstep, 0 in real time."""
+VOLTAGE, LOAD, STATUS = 1, 2, 4
+"""What a message carries, as bits."""
+_COMMAND: Final = {
+    "Mode": 1,
+    "Controlword": 2,
+    "VoltageQ": 3,
+    "VoltageD": 4,
+    "LoadEnable": 5,
+    "LoadTorque": 6,
+}
+_LOAD: Final = {"Enable": 5, "LoadTorque": 6}
+"""Places of a command's signals among the values; its counter has the first."""
+_MODE, _CONTROLWORD, _U_Q, _U_D, _ENABLE, _T_L = range(1, 7)
+F8, I8, U1, U4, I4 = (np.dtype(kind) for kind in ("f8", "i8", "u1", "u4", "i4"))
+ARRAYS: Final = {
+    "params": PARAMS, "state": STATE, "sample": SAMPLE, "whole": I8, "real": F8, "fields": I8, "values": F8,
+    "fds": I4, "times": I8, "cells": I8, "counters": I8, "raw": U1, "out": U1, "words": U4,
+    "wire": WIRE_STATE, "log": FRAME,
+    "taken": MESSAGE, "taken_signals": SIGNAL, "sent": MESSAGE, "sent_signals": SIGNAL,
+}  # fmt: skip
+"""The arrays behind the places of a call, in their order. ``whole`` and ``real`` are the sample as words of
+eight bytes, ``fields`` which of them go to the values, ``out`` room for each answer."""
+(
+    _PARAMS, _STATE, _SAMPLE, _WHOLE, _REAL, _FIELDS, _VALUES, _FDS, _TIMES, _CELLS, _COUNTERS, _RAW, _OUT,
+    _WORDS, _WIRE, _LOG, _TAKEN, _TAKEN_SIGNALS, _SENT, _SENT_SIGNALS,
+) = range(len(ARRAYS))  # fmt: skip
+
+
+class Station:
+    """:func:`attend` over one drive's records. ``cells`` and ``raw`` (the frame handed back) are shared."""
+
+    attend: Callable[[int], int]
+    """Serve until a moment [ns]; returns ANSWER, 0, the size of a frame in ``raw``, or -errno."""
+
+    def __init__(
+        self, link: SocketLink, frames: HouseFrames, records: tuple[Record, Record, Record], period_ns: int
+    ) -> None:
+        params, state, sample = records
+        self.cells = np.zeros(5, np.int64)
+        self.cells[SYNC_ID], self.cells[PERIOD_NS] = frames.sync_id or 0, period_ns
+        self.raw = np.zeros(FD_BYTES + DATA_AT, np.uint8)
+        taken, sent = _taken(frames), _sent(frames)
+        heads = [laid_out(message.send_id, message.length, message.fd) for message, _ in frames.answers]
+        self._alive = {
+            "params": params, "state": state, "sample": sample,
+            "whole": sample.view("i8"), "real": sample.view("f8"), "fields": _fields(frames),
+            "values": np.zeros(64), "fds": link.fds, "times": np.zeros(4, np.int64), "cells": self.cells,
+            "counters": frames.counters, "raw": self.raw, "out": np.concatenate(heads),
+            "words": np.zeros(2, np.uint32), "wire": np.zeros(1, WIRE_STATE), "log": np.zeros(0, FRAME),
+            "taken": taken[0], "taken_signals": taken[1], "sent": sent[0], "sent_signals": sent[1],
+        }  # fmt: skip
+        places = _places_of(self._alive)
+        self.attend = partial(entry(attend, places, 0), places)
+
+
+def station(
+    link: Link, frames: object, records: tuple[Record, Record, Record], period_ns: int
+) -> Station | None:
+    """The compiled way, where there is one: the house's frames on a socket that carries them."""
+    if not (COMPILED and isinstance(link, SocketLink) and isinstance(frames, HouseFrames)):
+        return None
+    if not link.carries(any(message.fd for message, _ in frames.answers)):
+        return None
+    return Station(link, frames, records, period_ns)
+
+
+def _places_of(arrays: dict[str, Any]) -> npt.NDArray[np.int64]:
+    return np.array([place_of(arrays[name], dtype) for name, dtype in ARRAYS.items()], np.int64)
+
+
+def _taken(frames: HouseFrames) -> tuple[Record, Record]:
+    """(messages, signals) of what commands the drive, in the order of their counters."""
+    tables = Tables()
+    inline = LOAD if frames.inline_load else 0
+    _add(
+        tables,
+        frames.command,
+        {n: i for n, i in _COMMAND.items() if n in frames.command.signals},
+        VOLTAGE | inline,
+    )
+    if frames.load_command:
+        _add(tables, frames.load_command, _LOAD, LOAD)
+    return tables.records()
+
+
+def _sent(frames: HouseFrames) -> tuple[Record, Record]:
+    """(messages, signals) of what a SYNC is answered with; the values follow one another."""
+    tables, place = Tables(), 1
+    for message, fields in frames.answers:
+        sources = {name: place + index for index, name in enumerate(fields)}
+        _add(tables, message, sources, STATUS if message is frames.status else 0)
+        place += len(fields)
+    return tables.records()
+
+
+def _add(tables: Tables, message: Message, sources: dict[str, int], carries: int) -> None:
+    counter = "Counter" if "Counter" in message.signals else ""
+    rows = [(message.signals[name], 0, 0, source, False) for name, source in sources.items()]
+    tables.add(Bound(message, counter, ()), rows, carries)
+
+
+def _fields(frames: HouseFrames) -> npt.NDArray[np.int64]:
+    """Word of the sample and whether it is a whole number, for each value from the second on."""
+    kinds = [SAMPLE.fields[name][:2] for _, fields in frames.answers for name in fields.values()]  # type: ignore[index]
+    return np.array([(at // 8, kind.kind == "i") for kind, at in kinds], np.int64).ravel()
+
+
+@jit
+def send_answer(places: Any, status_due: int) -> bool:
+    """Lay all out, then send: False, and nothing is sent, where a value does not fit its signal."""
+    fds, cells, counters = (
+        array_at(places, _FDS, I4),
+        array_at(places, _CELLS, I8),
+        array_at(places, _COUNTERS, I8),
+    )
+    messages, signals = array_at(places, _SENT, MESSAGE), array_at(places, _SENT_SIGNALS, SIGNAL)
+    whole, real = array_at(places, _WHOLE, I8), array_at(places, _REAL, F8)
+    values, fields, out = (
+        array_at(places, _VALUES, F8),
+        array_at(places, _FIELDS, I8),
+        array_at(places, _OUT, U1),
+    )
+    words, wire = array_at(places, _WORDS, U4), array_at(places, _WIRE, WIRE_STATE)
+    log = array_at(places, _LOG, FRAME)
+    for place in range(len(fields) // 2):
+        word = fields[2 * place]
+        values[place + 1] = float(whole[word]) if fields[2 * place + 1] else real[word]
+    for index in range(len(messages)):
+        m = messages[index]
+        if m["bit"] & STATUS and not status_due:
+            continue
+        if m["modulus"] > 0:
+            place = FIRST_ANSWER + index
+            counters[place] = (counters[place] + 1) % m["modulus"]
+            values[0] = counters[place]
+        if encode(out[index * FD_BYTES :], values, index, messages, signals, wire, words, log, 0) == REFUSED:
+            return False
+    for index in range(len(messages)):
+        m = messages[index]
+        if status_due or not m["bit"] & STATUS:
+            size = FD_BYTES if m["fd"] else CLASSIC_BYTES
+            cells[UNSENT] += transmit(fds, out[index * FD_BYTES :], size, wire, log) != DONE
+    return True
+
+
+@jit
+def take_sync(places: Any, now_ns: int) -> int:
+    """Move the plant on, latch, sample, answer. Returns DONE or ANSWER."""
+    p, s = array_at(places, _PARAMS, PARAMS)[0], array_at(places, _STATE, STATE)[0]
+    cells, out = array_at(places, _CELLS, I8), array_at(places, _SAMPLE, SAMPLE)[0]
+    if not cells[STARTED]:
+        cells[STARTED], cells[LAST_NS] = 1, now_ns
+    elif cells[PERIOD_NS] > 0:
+        advance(p, s, cells[PERIOD_NS])
+    else:
+        advance(p, s, now_ns - cells[LAST_NS])
+        cells[LAST_NS] = now_ns
+    on_sync(p, s, out)
+    if out["emcy_due"] or not send_answer(places, out["status_due"]):
+        return ANSWER
+    return DONE
+
+
+@jit
+def take_command(places: Any, index: int, now_ns: int) -> bool:
+    """Take a command that is whole, valid and fresh; False, and nothing has changed, for another."""
+    raw, counters = array_at(places, _RAW, U1), array_at(places, _COUNTERS, I8)
+    messages, signals = array_at(places, _TAKEN, MESSAGE), array_at(places, _TAKEN_SIGNALS, SIGNAL)
+    values, words = array_at(places, _VALUES, F8), array_at(places, _WORDS, U4)
+    p, s = array_at(places, _PARAMS, PARAMS)[0], array_at(places, _STATE, STATE)[0]
+    cells, m = array_at(places, _CELLS, I8), messages[index]
+    if int(raw[4]) != m["length"] or not is_valid(raw, m):
+        return False
+    values[_MODE] = VOLTAGE_MODE
+    counter = int(phys_of(raw, m["length"], signals[m["first"]], words))
+    for place in range(m["first"] + 1, m["first"] + m["count"]):
+        values[signals[place]["source"]] = phys_of(raw, m["length"], signals[place], words)
+    if values[_MODE] != VOLTAGE_MODE or counter == counters[index]:
+        return False
+    counters[index] = counter
+    if m["bit"] & VOLTAGE and cells[STARTED] and cells[PERIOD_NS] == 0:
+        advance(p, s, now_ns - cells[LAST_NS])
+        cells[LAST_NS] = now_ns
+    if m["bit"] & LOAD:
+        on_load_command(s, values[_T_L] if values[_ENABLE] else 0.0)
+    if m["bit"] & VOLTAGE:
+        on_command(s, counter, int(values[_CONTROLWORD]), values[_U_Q], values[_U_D])
+    return True
+
+
+@waiting
+def attend(places: Any, until_ns: int) -> Any:
+    """Take frames until ``until_ns`` [ns of CLOCK_MONOTONIC], silence, or one that the caller is to judge.
+
+    Returns ANSWER, 0, the size of that frame in ``raw``, or -errno.
+    """
+    fds, times = array_at(places, _FDS, I4), array_at(places, _TIMES, I8)
+    cells, raw = array_at(places, _CELLS, I8), array_at(places, _RAW, U1)
+    messages = array_at(places, _TAKEN, MESSAGE)
+    while True:
+        left_ns = until_ns - now_ns(times)
+        if left_ns <= 0:
+            return 0
+        ready = wait(fds, times, min(left_ns, IDLE_NS))
+        if ready <= 0:
+            return 0 if ready == -EINTR else ready
+        size = receive(fds, raw)
+        if size < 0:
+            return 0 if size in (-EAGAIN, -EINTR) else size
+        if size not in (CLASSIC_BYTES, FD_BYTES) or int(raw[4]) > size - DATA_AT:
+            continue  # no frame
+        if identifier(raw) == cells[SYNC_ID] and int(raw[4]) <= 1:  # CANopen: no data or the counter
+            if take_sync(places, now_ns(times)) != DONE:
+                return ANSWER
+            continue
+        index = find(raw, messages)
+        if index < 0 or not take_command(places, index, now_ns(times)):
+            return size
