@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, NoReturn
+from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -54,6 +54,14 @@ _GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD = range(6)
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
 _SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
+
+
+class Saved(NamedTuple):
+    """What the frames so far have left in a client: record of the kernels, last counters, own fields."""
+
+    state: bytes
+    counters: bytes
+    own: tuple[int, int, bool]
 
 
 class Outgoing:
@@ -416,6 +424,17 @@ class DriveClient:
             if frame is not None and frame.can_id | frame.flags in self._alive:
                 return True
         return False
+
+    def saved(self) -> Saved:
+        """What its frames have left in it, but for the tick; :meth:`restore` goes back there."""
+        own = self._sync_counter, self._pending_flags, self._down
+        return Saved(self._state.tobytes(), self._last.tobytes(), own)
+
+    def restore(self, saved: Saved) -> None:
+        """Be as one was when that was saved."""
+        self._state.view("u1")[:] = np.frombuffer(saved.state, np.uint8)
+        self._last.view("u1")[:] = np.frombuffer(saved.counters, np.uint8)
+        self._sync_counter, self._pending_flags, self._down = saved.own
 
     def discard(self) -> None:
         """Throw away what was received before the run."""

@@ -77,6 +77,18 @@ def transition_event(state: int, reason: int) -> tuple[str, str]:
     return ("stop", f"{name}: {Reason(reason).name}") if reason else ("state", name)
 
 
+def missed(heard: int, jumped: int, late_ns: int, period_ns: int) -> int:
+    """Periods that had no tick: those queued; where frames are missing, those that the clock counts.
+
+    ``heard``: measurements taken; ``jumped``: not 0 when a counter says that frames are missing; ``late_ns``:
+    since the next measurement was due.
+    """
+    queued = max(heard - 1, 0)
+    if heard and not jumped:
+        return queued
+    return max(queued, (late_ns + (period_ns // 2 if heard else 0)) // period_ns)
+
+
 class Cells:
     """The fields of the tick that the loop itself writes and reads."""
 
@@ -197,7 +209,8 @@ class Loop:
             flags[0] = flags[0] & ~fresh
             drive.receive(tick, NO_WAIT)
         now_ns = self._clock.now_ns()
-        skipped = self._missed(heard, now_ns) if k else 0
+        late_ns = now_ns - self._arrived_ns - plan.period_ns
+        skipped = missed(heard, flags[0] & COUNTER_JUMP, late_ns, plan.period_ns) if k else 0
         if heard:
             flags[0] = flags[0] | fresh
         if skipped:
@@ -214,15 +227,6 @@ class Loop:
         if t.rx_flags[0] & int(RxFlag.FRESH):
             self._arrived_ns = deadline_ns + t.received_ns[0]
         t.received_ns[0] = max(self._arrived_ns - deadline_ns, -MAX_NS)
-
-    def _missed(self, heard: int, now_ns: int) -> int:
-        """Periods that had no tick: those queued; where frames are missing, those that the clock counts."""
-        period_ns = self._plan.period_ns
-        queued = max(heard - 1, 0)
-        if heard and not self._cells.rx_flags[0] & COUNTER_JUMP:
-            return queued
-        late_ns = now_ns - self._arrived_ns - period_ns
-        return max(queued, (late_ns + (period_ns // 2 if heard else 0)) // period_ns)
 
     def _stamp(self, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         t = self._cells

@@ -24,16 +24,17 @@ import numpy as np
 
 from hil.app import Overrides, Setup, header_of, load_setup
 from hil.convert.export import replacing
-from hil.convert.periods import Heard, Period, periods, with_ahead
+from hil.convert.periods import HELD_PERIODS, MERGE_PERIODS, Heard, periods
 from hil.convert.recording import Recording
 from hil.convert.recordings import ID_MASK
-from hil.convert.rerun import NotOursError, Run
+from hil.convert.rerun import Run
+from hil.convert.search import NotOursError, Search
 from hil.log.errors import LogError
 from hil.log.mcapfile import RunFile
 from hil.log.records import FRAME_RECORD
 from hil.log.schema import FRAME
 from hil.loop import transition_event
-from hil.signals import TICK, DriveState, Reason
+from hil.signals import TICK, DriveState, Reason, RxFlag
 
 BLOCK: Final = 2048
 OURS: Final = "the commands are this controller's, to the bit"
@@ -63,10 +64,10 @@ class Output:
 
     def __init__(self, file: RunFile) -> None:
         self._file = file
-        self._ticks: list[bytes] = []
+        self._rows: list[bytes] = []
         self._frames: list[bytes] = []
         self._state = int(DriveState.SWITCH_ON_DISABLED)
-        self.last_ns = 0
+        self.last_ns = self.ticks = self.fresh = self.skipped = 0
 
     def passing(self, frames: Iterable[Heard]) -> Iterator[Heard]:
         """The frames, each kept on its way."""
@@ -81,19 +82,22 @@ class Output:
     def tick(self, ticks: Any) -> None:
         """Keep a tick, and an event when the supervisor's state changes."""
         tick = ticks[0]
+        self.ticks += 1
+        self.fresh += bool(int(tick["rx_flags"]) & RxFlag.FRESH)
+        self.skipped += int(tick["skipped"])
         if int(tick["state"]) != self._state:
             self._state = int(tick["state"])
             what = transition_event(self._state, int(tick["reason"]))
             self._file.add_event(int(tick["t_ns"]), int(tick["k"]), *what)
-        self._ticks.append(ticks.tobytes())
-        if len(self._ticks) == BLOCK:
+        self._rows.append(ticks.tobytes())
+        if len(self._rows) == BLOCK:
             self.flush()
 
     def flush(self) -> None:
         """Hand the blocks to the file."""
-        self._file.add_ticks(np.frombuffer(b"".join(self._ticks), TICK))
+        self._file.add_ticks(np.frombuffer(b"".join(self._rows), TICK))
         self._file.add_frames(np.frombuffer(b"".join(self._frames), FRAME))
-        self._ticks, self._frames = [], []
+        self._rows, self._frames = [], []
 
 
 def import_recording(
@@ -127,6 +131,7 @@ def import_recording(
 def _carry(setup: Setup, recording: Recording, part: Path, out: Path, why: str = "") -> Imported:
     """One pass over the recording; ``why``: what this controller was found not to have sent."""
     run, frames = Run(setup), recording.frames()
+    merge = MERGE_PERIODS if run.shadow else HELD_PERIODS
     first = next(frames, None)
     if first is None:
         raise LogError(f"{recording.path}: {recording.damage or 'has no frames'}{_other_channels(recording)}")
@@ -135,42 +140,32 @@ def _carry(setup: Setup, recording: Recording, part: Path, out: Path, why: str =
         output = Output(file)
         loop = setup.config.loop
         passing = output.passing(itertools.chain([first], frames))
-        count = _ticks(run, output, periods(passing, run.roles, loop.timeout_ns, loop.period_ns))
+        found = periods(passing, run.roles, loop.timeout_ns, loop.period_ns, merge)
+        if not run.shadow:  # a drive that sends by its own clock was there before this controller
+            found = itertools.dropwhile(lambda period: not period.commands, found)
+        for ticks in Search(run).ticks(found):
+            output.tick(ticks)
         for _ in passing:
             pass  # what comes after the run is kept as frames
-        _check(recording, run, count)
+        count = output.ticks
+        _check(recording, run, output)
         output.flush()
         ended = Reason(int(run.ticks["reason"][0])).name.lower() if run.over else "the recording ends here"
         file.add_event(output.last_ns, max(count - 1, 0), "import", f"{recording.path.name}: {commands}")
         if recording.damage:
             file.add_event(output.last_ns, max(count - 1, 0), "damage", recording.damage)
-        file.finish({"ended": ended, "ticks": count, "skipped": run.skipped, "commands": commands})
-    return Imported(
-        str(out), count, run.skipped, recording.count, commands, ended, recording.set_right, recording.damage
-    )
-
-
-def _ticks(run: Run, output: Output, found: Iterator[Period]) -> int:
-    """The ticks of all periods into the log; one that is cut off by the recording's end is left out."""
-    count = 0
-    for period, ahead in with_ahead(found):
-        if not (period.closed or period.commands):
-            break
-        run.take(period, ahead)
-        output.tick(run.ticks)
-        count += 1
-        if run.over:
-            break
-    return count
+        file.finish({"ended": ended, "ticks": count, "skipped": output.skipped, "commands": commands})
+    skipped, right = output.skipped, recording.set_right
+    return Imported(str(out), count, skipped, recording.count, commands, ended, right, recording.damage)
 
 
 def _other_channels(recording: Recording) -> str:
     return f"; channels there are {recording.channels}" if recording.channel is not None else ""
 
 
-def _check(recording: Recording, run: Run, count: int) -> None:
+def _check(recording: Recording, run: Run, output: Output) -> None:
     """A recording without a tick or a measurement is of another bus. Raises LogError."""
-    if count and run.fresh:
+    if output.fresh:
         return
     seen = ", ".join(f"{can_id & ID_MASK:X}" for can_id in sorted(recording.identifiers)[:20])
     measured = ", ".join(f"{can_id & ID_MASK:X}" for can_id in sorted(run.roles.measuring))

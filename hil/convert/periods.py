@@ -9,9 +9,17 @@ from typing import Final, NamedTuple
 
 FOLLOW_TICKS: Final = 1000
 EARLY_SHARE: Final = 10
+"""No stamp is taken to be earlier than its deadline by more than this part of a period,"""
+TIGHT_SHARE: Final = 50
+"""and none that the grid has been set back to by more than this."""
 AHEAD: Final = 4
+BURST: Final = 3
 MERGE_PERIODS: Final = 5
 """So long after a command a measurement without one counts as skipped by the controller."""
+HELD_PERIODS: Final = 1000
+"""The same where the controller is this one: it comes back from being stopped, or its run is over."""
+GAPS_MOST: Final = 100
+"""So many gaps are tried between those that the stamps leave open; over 64 periods none is like another."""
 MOST_NS: Final = 2**31 - 1
 
 
@@ -71,14 +79,24 @@ class Period:
         self.sent_ns = frame.t_ns
 
 
-def periods(frames: Iterable[Heard], roles: Roles, timeout_ns: int, period_ns: int) -> Iterator[Period]:
-    """The ticks that the frames make up."""
+class Whose(NamedTuple):
+    """A frame, whether the controller sent it, and whether its own side recorded it, as read."""
+
+    frame: Heard
+    own: bool
+    as_read: bool
+
+
+def periods(
+    frames: Iterable[Heard], roles: Roles, timeout_ns: int, period_ns: int, merge: int = MERGE_PERIODS
+) -> Iterator[Period]:
+    """The ticks that the frames make up. ``merge``: periods, of :data:`MERGE_PERIODS`."""
     if roles.sync is None:
-        return _by_feedback(_with_foreign(frames, roles), roles, period_ns)
+        return _by_feedback(_with_foreign(frames, roles), roles, period_ns, merge * period_ns)
     return _by_sync(_with_foreign(frames, roles), roles, timeout_ns)
 
 
-def _with_foreign(frames: Iterable[Heard], roles: Roles) -> Iterator[tuple[Heard, bool]]:
+def _with_foreign(frames: Iterable[Heard], roles: Roles) -> Iterator[Whose]:
     """Each frame and whether the controller sent it.
 
     A recording made by the controller's own side says so of its frames; a command that it *received* is then
@@ -90,17 +108,17 @@ def _with_foreign(frames: Iterable[Heard], roles: Roles) -> Iterator[tuple[Heard
         own = frame.can_id in ours
         if own and own_side is None:
             own_side = not frame.received
-        yield frame, own and not (own_side and frame.received)
+        yield Whose(frame, own and not (own_side and frame.received), bool(own_side))
 
 
-def _by_sync(frames: Iterable[tuple[Heard, bool]], roles: Roles, timeout_ns: int) -> Iterator[Period]:
+def _by_sync(frames: Iterable[Whose], roles: Roles, timeout_ns: int) -> Iterator[Period]:
     """A tick begins with SYNC; what the drive says after the tick's command is late for it.
 
     Where no command was sent, it is late after the timeout. What came before the first SYNC is not the run's.
     """
     period: Period | None = None
     late: list[Heard] = []
-    for frame, own in frames:
+    for frame, own, _ in frames:
         if own and frame.can_id == roles.sync:
             if period is not None:
                 late = period.cut(timeout_ns) + late
@@ -120,21 +138,21 @@ def _by_sync(frames: Iterable[tuple[Heard, bool]], roles: Roles, timeout_ns: int
         yield period
 
 
-def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles, period_ns: int) -> Iterator[Period]:
+def _by_feedback(frames: Iterable[Whose], roles: Roles, period_ns: int, merge_ns: int) -> Iterator[Period]:
     """A tick is a measurement that is complete, and the commands up to where the next one begins.
 
     Of several measurements before a command the loop takes the newest and counts the others as skipped. A
     command without a measurement is a tick whose wait was in vain. What else the drive says after it has
-    measured is read with the next tick.
+    measured is read with the next tick, unless the controller itself has recorded that it read it before.
     """
     period, queued, missing = Period(0), list[Heard](), set(roles.measuring)
-    commanded_ns = -MERGE_PERIODS * period_ns
-    for frame, own in frames:
+    commanded_ns = -merge_ns
+    for frame, own, as_read in frames:
         measures = not own and frame.can_id in roles.measuring
         again = own and any(frame.can_id == other.can_id for other in period.commands)
         opened = not missing or bool(period.commands)
         together = not period.commands and (
-            frame.t_ns - period.t_ns < period_ns // 2 or frame.t_ns - commanded_ns < MERGE_PERIODS * period_ns
+            frame.t_ns - period.t_ns < period_ns // 2 or frame.t_ns - commanded_ns < merge_ns
         )
         if again or (measures and opened and not together):
             yield period
@@ -144,7 +162,7 @@ def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles, period_ns: 
             period.command(frame)
             commanded_ns = frame.t_ns
             period.t_ns = frame.t_ns if missing else period.t_ns
-        elif opened and not measures:
+        elif opened and not measures and (period.commands or not as_read):
             queued.append(frame)
         else:
             period.answers += queued
@@ -157,22 +175,37 @@ def _by_feedback(frames: Iterable[tuple[Heard, bool]], roles: Roles, period_ns: 
         yield period
 
 
-def with_ahead(found: Iterable[Period]) -> Iterator[tuple[Period, list[int]]]:
-    """Each period with the stamps of the few that follow it."""
+def with_ahead(found: Iterable[Period], period_ns: int = 0) -> Iterator[tuple[Period, list[int]]]:
+    """Each period with the stamps of the few that follow it, up to those that make up a burst.
+
+    A loop has at most three ticks within ``period_ns``; more are the frames that stop the drive.
+    """
     window: deque[Period] = deque()
     for period in found:
         window.append(period)
-        if len(window) > AHEAD:
-            yield window.popleft(), [one.t_ns for one in window]
+        if len(window) > AHEAD + BURST:
+            yield window.popleft(), _stamps(window, period_ns)
     while window:
-        yield window.popleft(), [one.t_ns for one in window]
+        yield window.popleft(), _stamps(window, period_ns)
+
+
+def _stamps(window: deque[Period], period_ns: int) -> list[int]:
+    stamps = [period.t_ns for period in window]
+    burst = (at for at, t_ns in enumerate(stamps[BURST:]) if t_ns - stamps[at] < period_ns)
+    return stamps[: min(next(burst, AHEAD), AHEAD)]
+
+
+def around(first: int, least: int, most: int) -> list[int]:
+    """Gaps to be tried: ``first``, the ends of what the stamps leave open, beside it, what is between."""
+    between = range(least, min(most + 1, least + GAPS_MOST))
+    return [gap for gap in dict.fromkeys([first, least, most, first - 1, first + 1, *between]) if gap > 0]
 
 
 class Grid:
     """Deadlines for stamps: one a period from the first stamp on, whole periods skipped as the loop does.
 
-    The recorder's clock is not the loop's: the grid is set back at once by a stamp that comes early by more
-    than a tenth of a period, and forward each thousand ticks by the least lateness among them.
+    The recorder's clock is not the loop's: the grid is set back at once by a stamp that comes early, and
+    forward each thousand ticks by the least lateness among them.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -181,19 +214,40 @@ class Grid:
         self._least_ns, self._left = MOST_NS, FOLLOW_TICKS
         self.k = -1
 
+    def saved(self) -> tuple[int, int, int, int]:
+        """What the ticks so far have left; :meth:`restore` goes back there."""
+        return self._start_ns, self._least_ns, self._left, self.k
+
+    def restore(self, saved: tuple[int, int, int, int]) -> None:
+        """Be as one was when that was saved."""
+        self._start_ns, self._least_ns, self._left, self.k = saved
+
     def gap(self, t_ns: int, ahead: Iterable[int]) -> int:
-        """Periods from the last tick to one whose SYNC is stamped ``t_ns``.
+        """Periods from the last tick to one whose SYNC is stamped ``t_ns``, at most.
 
         A SYNC may come late although its tick was on time (the process was held up between the two). The
         stamps ``ahead`` tell: none of them can come before its deadline.
         """
         if self.k < 0:
             return 1
-        gap = (t_ns - self._start_ns) // self._period_ns - self.k
+        gap = self._since(t_ns, TIGHT_SHARE)
         for later, stamp_ns in enumerate(ahead, start=1):
-            since_ns = stamp_ns + self._period_ns // EARLY_SHARE - self._start_ns
-            gap = min(gap, since_ns // self._period_ns - later - self.k)
+            gap = min(gap, self._since(stamp_ns, EARLY_SHARE) - later)
         return max(1, gap)
+
+    def gaps(self, t_ns: int, ahead: Iterable[int], since_ns: int) -> list[int]:
+        """:meth:`gap` and what else it may be, the likeliest first. ``since_ns``: the last tick's last frame.
+
+        The loop woke between the two stamps. Where the stamps ahead say that SYNC came later than that, it
+        was held up after it woke, and then most likely had woken on time.
+        """
+        most = self.gap(t_ns, ahead)
+        least = min(max(1, self._since(since_ns, TIGHT_SHARE)), most) if self.k >= 0 else 1
+        return around(least if most < self._since(t_ns, TIGHT_SHARE) else most, least, most)
+
+    def _since(self, t_ns: int, share: int) -> int:
+        """Periods from the last tick's deadline to a stamp that may be early by a share of one."""
+        return (t_ns + self._period_ns // share - self._start_ns) // self._period_ns - self.k
 
     def place(self, t_ns: int, gap: int) -> int:
         """Take the tick; return its deadline [ns]."""
@@ -205,7 +259,7 @@ class Grid:
         return self._start_ns + self.k * self._period_ns
 
     def _follow(self, lateness_ns: int) -> None:
-        if lateness_ns < -self._period_ns // EARLY_SHARE:
+        if lateness_ns < 0:
             self._start_ns += lateness_ns
         self._least_ns, self._left = min(self._least_ns, lateness_ns), self._left - 1
         if self._left == 0:

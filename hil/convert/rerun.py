@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import deque
-from collections.abc import Iterable
-from typing import Final
+from collections.abc import Iterable, Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
 
 from drivers.binding import Binding
 from drivers.bus import Frame
-from drivers.client import DriveClient
+from drivers.client import DriveClient, Saved
 from drivers.mapping import MEASURED
 from drivers.watch import CommandWatch
 from hil.app import Setup
-from hil.convert.periods import MOST_NS, Grid, Heard, Period, Roles
+from hil.convert.periods import MOST_NS, Grid, Heard, Period, Roles, around
 from hil.convert.recordings import ID_MASK
-from hil.errors import HilError
-from hil.loop import ENDED
+from hil.loop import COUNTER_JUMP, ENDED, missed
 from hil.shadow import ShadowDrive
 from hil.signals import Request, RxFlag, new_ticks
 
@@ -24,8 +24,7 @@ FAR_NS: Final = 2**62
 """A deadline that does not come: a wait ends with feedback or with the period's frames."""
 
 
-class NotOursError(HilError):
-    """The recorded commands are not what this controller gives."""
+CUTS_MOST: Final = 64
 
 
 class Tape:
@@ -38,6 +37,14 @@ class Tape:
     def lay(self, frames: Iterable[Heard]) -> None:
         """Frames to be received next."""
         self._queue.extend(frames)
+
+    def saved(self) -> tuple[Heard, ...]:
+        """What was not read yet."""
+        return tuple(self._queue)
+
+    def restore(self, saved: tuple[Heard, ...]) -> None:
+        """Have that to be received, and nothing else."""
+        self._queue = deque(saved)
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Keep a frame."""
@@ -67,6 +74,18 @@ def roles_of(binding: Binding) -> Roles:
     return Roles(binding.sync.send_id if binding.sync else None, frozenset(measuring), commands)
 
 
+class Before(NamedTuple):
+    """All that a tick changes, as it was before it; records as bytes, ten times as fast as by fields."""
+
+    records: list[bytes]
+    client: Saved
+    queue: tuple[Heard, ...]
+    left: list[Heard]
+    grid: tuple[int, int, int, int]
+    arrived_ns: int
+    asked: int
+
+
 class Run:
     """The controller over a recording's periods; one tick record is filled anew for each."""
 
@@ -81,31 +100,101 @@ class Run:
         self._watch = CommandWatch(setup.binding) if self.shadow else None
         self._drive = ShadowDrive(self._client, self._watch.applied) if self._watch else self._client
         self._machine, self.ticks = setup.machine.fresh(), new_ticks()
+        records = self._machine.safety_state, self._machine.law_state, self.ticks
+        self._records = [record.view(np.uint8) for record in records]
         self._tick = self.ticks[0]  # one object for all: the client binds itself to it
-        self._grid = Grid(config.loop.period_ns)
+        self.period_ns = config.loop.period_ns
+        self._grid = Grid(self.period_ns)
+        self._left: list[Heard] = []
+        self._since_ns = self._read_ns = self._arrived_ns = 0
         self._asked = int(Request.ARM)
-        self.fresh = self.skipped = 0
+        self.tries = 0
 
-    def take(self, period: Period, ahead: list[int]) -> None:
-        """Run the tick of a period; ``ahead``: stamps of those that follow. Raises NotOursError."""
+    def before(self) -> Before:
+        """What :meth:`restore` takes to go back to now."""
+        return Before(
+            [record.tobytes() for record in self._records],
+            self._client.saved(),
+            self.tape.saved(),
+            self._left,
+            self._grid.saved(),
+            self._arrived_ns,
+            self._asked,
+        )
+
+    def restore(self, before: Before) -> None:
+        """Go back to before a tick."""
+        for record, saved in zip(self._records, before.records, strict=True):
+            record[:] = np.frombuffer(saved, np.uint8)
+        self._client.restore(before.client)
+        self.tape.restore(before.queue)
+        self._grid.restore(before.grid)
+        self._left, self._arrived_ns, self._asked = before.left, before.arrived_ns, before.asked
+
+    def take(self, before: Before, period: Period, ahead: list[int]) -> Iterator[None]:
+        """Run the tick of a period once for each way in which this controller sends what was recorded.
+
+        The likeliest first. ``before``: where it begins, and where it must stand when the first is asked for;
+        ``ahead``: stamps of the periods that follow.
+        """
+        for cut in self._cuts(period):
+            gaps = self._read(period, ahead, cut)
+            for gap, request in self._ways(gaps, whole=cut == len(period.answers)):
+                self.tries += 1
+                self._step(period, gap, request)
+                if self._sends(period):
+                    self._asked = request
+                    self._stamp(period, gap)
+                    yield
+                self.restore(before)
+                self._read(period, ahead, cut)
+            self.restore(before)
+
+    def _cuts(self, period: Period) -> Iterator[int]:
+        """How many of the answers were read: all; or all before one that came after the read had ended.
+
+        Between reading and sending the controller may be held up; the next tick reads what came meanwhile.
+        """
+        answers = period.answers
+        yield len(answers)
+        if not self.shadow and period.commands:
+            measures = (at for at, frame in enumerate(answers) if frame.can_id in self.roles.measuring)
+            yield from sorted(measures, reverse=True)[:CUTS_MOST]
+
+    def _ways(self, gaps: list[int], *, whole: bool) -> Iterator[tuple[int, int]]:
+        """Gap and request, the likeliest first: a stop that is asked for shows whatever the gap."""
+        if self.shadow:
+            yield gaps[0], int(Request.ARM)
+            return
+        for asked in (Request.ARM, Request.STOP, Request.QUICK_STOP):
+            if asked == self._asked or (whole and asked > self._asked):
+                yield gaps[0], int(asked)
+        for gap in gaps[1:]:
+            yield gap, self._asked
+
+    def _read(self, period: Period, ahead: list[int], cut: int) -> list[int]:
+        """Read what the loop has read; return the gaps that the tick may have, the likeliest first."""
         self._tick["rx_flags"] = 0
+        read, left = period.answers[:cut], period.answers[cut:]
+        self._read_ns = read[-1].t_ns if read else -1
         if self.roles.sync is None:
-            gap = self._newest(period)
+            self.tape.lay([*self._left, *read])
+            gaps = self._newest(period)
         else:
-            self.tape.lay(period.late)
+            self.tape.lay([*self._left, *period.late])
             self._client.sync(self._tick)
-            self.tape.lay(period.answers)
+            self.tape.lay(read)
             self._drive.receive(self._tick, FAR_NS)
-            gap = self._grid.gap(period.t_ns, ahead)
-        self.fresh += bool(int(self._tick["rx_flags"]) & RxFlag.FRESH)
-        gap = self._compute(period, gap)
-        self.skipped += gap - 1
-        self._stamp(period, gap)
+            gaps = self._grid.gaps(period.t_ns, ahead, self._arrived_ns)
+        self._left = left
+        return gaps
 
-    def _newest(self, period: Period) -> int:
-        """Take measurements as the loop does that waits for them: the newest counts, others are skipped."""
-        tick, heard = self._tick, 0
-        self.tape.lay(period.answers)
+    def _newest(self, period: Period) -> list[int]:
+        """Take measurements as the loop does that waits for them: the newest counts, others are skipped.
+
+        When the loop had read is known where it has read something, else as late as the command allows.
+        """
+        tick, heard, jumped = self._tick, 0, 0
         self._drive.receive(tick, FAR_NS)
         while int(tick["rx_flags"]) & RxFlag.FRESH:
             heard += 1
@@ -113,40 +202,30 @@ class Run:
             self._drive.receive(tick, FAR_NS)
         if heard:
             tick["rx_flags"] = int(tick["rx_flags"]) | int(RxFlag.FRESH)
-        return heard if heard and self._grid.k >= 0 else 1
+        if self._grid.k < 0:
+            return [1]
+        jumped = int(tick["rx_flags"]) & COUNTER_JUMP
+        due_ns = self._arrived_ns + self.period_ns
+        least_ns = max(self._read_ns, due_ns if heard else due_ns + self.period_ns // 2)
+        most_ns = max(period.sent_ns, least_ns)
+        least, most = (
+            1 + missed(heard, jumped, now_ns - due_ns, self.period_ns) for now_ns in (least_ns, most_ns)
+        )
+        return around(least if heard else most, least, most)
 
-    def _compute(self, period: Period, gap: int) -> int:
-        """Run the controller; return the gap that the tick has."""
-        if self._watch is None:
-            return self._guess(period, gap)
-        self._step(gap, int(Request.ARM))
-        for frame in period.commands:
-            if frame.can_id == self._setup.binding.command.message.send_id:
-                self._watch.take(frame.data)
-        return gap
-
-    def _step(self, gap: int, request: int) -> None:
+    def _step(self, period: Period, gap: int, request: int) -> None:
         self.ticks["gap"], self.ticks["request"] = gap, request
         self._machine.prepare(self.ticks)
         self._machine.step(self.ticks)
-
-    def _guess(self, period: Period, expected: int) -> int:
-        """Find the gap and the request under which this controller sends what was recorded."""
-        states = (self._machine.safety_state, self._machine.law_state)
-        before = [state.copy() for state in states]
-        gaps = dict.fromkeys((expected, max(1, expected - 1), expected + 1))
-        asked = [value for value in (Request.ARM, Request.STOP, Request.QUICK_STOP) if value >= self._asked]
-        for gap, request in itertools.product(gaps, asked):
-            for state, saved in zip(states, before, strict=True):
-                state[:] = saved
-            self._step(gap, int(request))
-            if self._sends(period):
-                self._asked = int(request)
-                return gap
-        raise NotOursError(f"at {period.t_ns * 1e-9:.6f} s this controller sends something else")
+        if self._watch is not None:
+            for frame in period.commands:
+                if frame.can_id == self._setup.binding.command.message.send_id:
+                    self._watch.take(frame.data)
 
     def _sends(self, period: Period) -> bool:
         """Whether the tick's command is the recorded one; after the last come those that stop the drive."""
+        if self.shadow:
+            return True
         sent = self.tape.sent
         sent.clear()
         if self._tick["send"]:
@@ -166,6 +245,7 @@ class Run:
 
     def _stamp(self, period: Period, gap: int) -> None:
         """The times of a tick, as far as the recording has them."""
+        self._note_arrival(period, gap)
         tick, deadline_ns = self._tick, self._grid.place(period.t_ns, gap)
         tick["k"], tick["t_ns"], tick["gap"], tick["skipped"] = self._grid.k, deadline_ns, gap, gap - 1
         lateness_ns = period.t_ns - deadline_ns
@@ -173,3 +253,13 @@ class Run:
         latest = tick["lateness_ns"] = max(-MOST_NS, min(lateness_ns, MOST_NS))
         for name, t_ns in since.items():
             latest = tick[name] = min(t_ns - deadline_ns, MOST_NS) if t_ns >= 0 else latest
+
+    def _note_arrival(self, period: Period, gap: int) -> None:
+        """From when the next tick counts: with SYNC the last frame of this one, else as the loop does."""
+        fresh = bool(int(self._tick["rx_flags"]) & RxFlag.FRESH)
+        if self.roles.sync is not None:
+            self._arrived_ns = max(period.t_ns, period.answered_ns, period.sent_ns)
+        elif fresh or self._grid.k < 0:
+            self._arrived_ns = self._read_ns if self._read_ns >= 0 else period.t_ns
+        else:
+            self._arrived_ns += gap * self.period_ns
