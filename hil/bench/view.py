@@ -11,6 +11,7 @@ from hil.errors import HilError
 COMPARED: Final = {
     "rate_hz": "higher",
     "bare_rate_hz": "higher",
+    "rate_ratio": "higher",
     "processor_us": "lower",
     "bare_processor_us": "lower",
     "processor_ratio": "lower",
@@ -63,7 +64,9 @@ def _cost(result: dict[str, Any]) -> str:
 
 
 def _rate(result: dict[str, Any]) -> str:
-    text = f"{result['rate_hz']} Hz with 99.9 % of the ticks in time, bare loop {result['bare_rate_hz']} Hz"
+    ratio = result["rate_ratio"]
+    text = f"{ratio:.2f} x the bare loop's: " if ratio is not None else ""
+    text += f"{result['rate_hz']} Hz of {result['bare_rate_hz']} Hz with 99.9 % of the ticks in time"
     return text if result["tried"] else text + " (other rates not tried)"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from hil.bench.cyclictest import MISSING, cyclictest, parse
 from hil.bench.histogram import TOP_US, Histogram
 from hil.bench.machine import machine_facts, resident_kib
-from hil.bench.measure import highest, phases
+from hil.bench.measure import TRIES, highest, phases, rates_that_hold
 from hil.bench.meter import LOOP, Meter
 from hil.bench.view import ratios, read_result
 from hil.errors import HilError
@@ -88,6 +89,24 @@ def test_the_highest_rate_is_found_with_few_tries(limit: int) -> None:
 
     assert highest([1, 2, 3, 4, 5], holds) == (limit if limit <= 5 else 5)
     assert len(asked) <= 3
+
+
+def test_a_stall_that_spoils_a_probe_does_not_decide_on_a_rate() -> None:
+    """Each rate has three probes, of which one must hold; the first that does is the last."""
+    top, spoiled, asked = {"hil": 4000, "bare": 5000}, {("hil", 4000): 2, ("bare", 5000): 3}, Counter[Any]()
+
+    def probe(loop: str, rate_hz: int) -> float:
+        asked[loop, rate_hz] += 1
+        return (
+            0.9995
+            if rate_hz <= top[loop] and asked[loop, rate_hz] > spoiled.get((loop, rate_hz), 0)
+            else 0.99
+        )
+
+    found, tried = rates_that_hold([2000, 3000, 4000, 5000, 6000], probe)
+    assert found == {"hil": 4000, "bare": 4000}
+    assert asked["hil", 4000] == TRIES and asked["bare", 5000] == TRIES and asked["bare", 4000] == 1
+    assert len(tried) == asked.total() and {one["in_time"] for one in tried} == {0.9995, 0.99}
 
 
 def test_phases_are_differences_of_the_stamps() -> None:
