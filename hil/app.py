@@ -458,7 +458,9 @@ def _run_armed(
     request: StopRequest,
 ) -> RunResult:
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
-    loop = Loop(drive, clock, recorder, machine.looped(), new_ticks(), plan, request)
+    ticks = new_ticks()
+    recorder.attach(ticks)
+    loop = Loop(drive, clock, recorder, machine.looped(), ticks, plan, request)
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:

@@ -25,9 +25,8 @@ GOOD: Final = 0.999
 METERED_S: Final = 5.0
 TRIES: Final = 3
 """A stall of the whole machine spoils a probe of either loop; each has so many to reach a rate."""
-RATES: Final = (
-    1000, 2000, 2500, 3000, 3500, 4000, 4500, 5000, 5500, 6000, 6500, 7000, 8000, 9000, 10_000,
-)  # fmt: skip
+RATES: Final = (1000, 1250, 1600, 2000, 2500, 3200, 4000, 5000, 6250, 8000, 10_000)
+"""A loop's period is a whole number of nanoseconds."""
 Say = Callable[[str], None]
 Probe = Callable[[str, int], float]
 """Share of the periods in time, of the loop by its name at a rate [Hz]."""

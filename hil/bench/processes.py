@@ -52,6 +52,13 @@ class Stand:
         return replace(self.overrides, settings=(*self.overrides.settings, *more))
 
 
+def share_in_time(ticks: TickArray, rate_hz: int) -> float:
+    """Share of the periods in which the command went out before the next deadline, on fresh feedback."""
+    fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
+    good = np.count_nonzero(fresh & (ticks["sent_ns"] < 1_000_000_000 // rate_hz))
+    return float(good) / max(1, int(ticks["k"][-1]) + 1) if len(ticks) else 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class LoopRun:
     """One `hil run`: its ticks, what it said, and from its start to arming [s]."""
@@ -65,11 +72,8 @@ class LoopRun:
 
     @property
     def in_time(self) -> float:
-        """Share of the periods in which the command went out before the next deadline, on fresh feedback."""
-        ticks = self.ticks
-        fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
-        good = np.count_nonzero(fresh & (ticks["sent_ns"] < 1_000_000_000 // self.rate_hz))
-        return float(good) / max(1, int(ticks["k"][-1]) + 1) if len(ticks) else 0.0
+        """:func:`share_in_time` of the run."""
+        return share_in_time(self.ticks, self.rate_hz)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.codec import Database
+from hil.bench.processes import share_in_time
 from hil.log.reader import Log, open_log
 from hil.replay import replay_log
 from hil.signals import DriveState, RxFlag
@@ -97,6 +98,15 @@ def assert_nothing_after_the_stop(run: Seen) -> None:
 @pytest.mark.parametrize("name", ["vcan_two_processes", "kvaser_pair"])
 def test_a_run_between_two_processes(socketcan: Path, name: str, figures: list[str]) -> None:
     steady(seen(socketcan, name), name, figures)
+
+
+def test_5_khz_in_time(socketcan: Path, figures: list[str]) -> None:
+    """99.9 % of the commands go out before the next deadline, the drive, candump and the log beside."""
+    run = seen(socketcan, "vcan_5_khz")
+    steady(run, "vcan_5_khz", figures)
+    share = share_in_time(run.log.ticks, 5000)
+    figures.append(f"vcan_5_khz: {100 * share:.2f} % in time")
+    assert share >= 0.999
 
 
 def test_64_byte_frames_on_vcan(socketcan: Path, figures: list[str]) -> None:

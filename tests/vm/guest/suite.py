@@ -89,6 +89,12 @@ def vcan_two_processes() -> None:
         s.start()
 
 
+def vcan_5_khz() -> None:
+    settings = ("loop.rate_hz=5000", "loop.feedback_timeout_us=160")
+    with Scenario("vcan_5_khz", seconds=0.6, settings=settings) as s:
+        s.start()
+
+
 def rehearsal() -> None:
     """Not judged: every page of a run is touched once, so that none is fetched from the host later."""
     with Scenario("rehearsal", seconds=0.5) as s:
@@ -348,6 +354,7 @@ def main() -> int:
     scenarios: list[Callable[[], None]] = [
         rehearsal,
         vcan_two_processes,
+        vcan_5_khz,
         kvaser_pair,
         vcan_fd,
         vcan_other_drive,
