@@ -24,7 +24,18 @@ FAR_NS: Final = 2**62
 """A deadline that does not come: a wait ends with feedback or with the period's frames."""
 
 
-CUTS_MOST: Final = 64
+READINGS_MOST: Final = 64
+UNLIKELY_GAPS: Final = 6
+"""Gaps that are tried with a reading that is not the likely one."""
+STOPS: Final = (Request.STOP, Request.QUICK_STOP)
+
+
+class Reading(NamedTuple):
+    """Which of the frames that came since the last read were read before SYNC, and which by the command."""
+
+    sync: int
+    end: int
+    likely: bool = False
 
 
 class Tape:
@@ -103,6 +114,7 @@ class Run:
         records = self._machine.safety_state, self._machine.law_state, self.ticks
         self._records = [record.view(np.uint8) for record in records]
         self._tick = self.ticks[0]  # one object for all: the client binds itself to it
+        self._drive.prepare(self._tick)
         self.period_ns = config.loop.period_ns
         self._grid = Grid(self.period_ns)
         self._left: list[Heard] = []
@@ -137,9 +149,9 @@ class Run:
         The likeliest first. ``before``: where it begins, and where it must stand when the first is asked for;
         ``ahead``: stamps of the periods that follow.
         """
-        for cut in self._cuts(period):
-            gaps = self._read(period, ahead, cut)
-            for gap, request in self._ways(gaps, whole=cut == len(period.answers)):
+        for reading in self._readings(period):
+            gaps = self._read(reading, period, ahead)
+            for gap, request in self._ways(gaps, reading):
                 self.tries += 1
                 self._step(period, gap, request)
                 if self._sends(period):
@@ -147,54 +159,61 @@ class Run:
                     self._stamp(period, gap)
                     yield
                 self.restore(before)
-                self._read(period, ahead, cut)
+                self._read(reading, period, ahead)
             self.restore(before)
 
-    def _cuts(self, period: Period) -> Iterator[int]:
-        """How many of the answers were read: all; or all before one that came after the read had ended.
+    def _readings(self, period: Period) -> Iterator[Reading]:
+        """What the loop may have read: all; or less, since it was held up between reading and sending.
 
-        Between reading and sending the controller may be held up; the next tick reads what came meanwhile.
+        What came meanwhile is on the wire before what was sent, but read after it: before the command, the
+        next tick reads it; before SYNC, it is no late answer but this tick's.
         """
-        answers = period.answers
-        yield len(answers)
-        if not self.shadow and period.commands:
-            measures = (at for at, frame in enumerate(answers) if frame.can_id in self.roles.measuring)
-            yield from sorted(measures, reverse=True)[:CUTS_MOST]
+        frames = [*self._left, *period.late, *period.answers]
+        end = len(frames)
+        sync = 0 if self.roles.sync is None else end - len(period.answers)
+        yield Reading(sync, end, likely=True)
+        if self.shadow or not period.commands:
+            return
+        measures = [at for at, frame in enumerate(frames) if frame.can_id in self.roles.measuring]
+        for at in measures[: -READINGS_MOST - 1 : -1]:
+            yield Reading(sync, at) if at >= sync else Reading(at, end)
 
-    def _ways(self, gaps: list[int], *, whole: bool) -> Iterator[tuple[int, int]]:
+    def _ways(self, gaps: list[int], reading: Reading) -> Iterator[tuple[int, int]]:
         """Gap and request, the likeliest first: a stop that is asked for shows whatever the gap."""
         if self.shadow:
             yield gaps[0], int(Request.ARM)
             return
-        for asked in (Request.ARM, Request.STOP, Request.QUICK_STOP):
-            if asked == self._asked or (whole and asked > self._asked):
-                yield gaps[0], int(asked)
-        for gap in gaps[1:]:
+        yield gaps[0], self._asked
+        if reading.likely:
+            yield from ((gaps[0], int(asked)) for asked in STOPS if asked > self._asked)
+        for gap in gaps[1:] if reading.likely else gaps[1:UNLIKELY_GAPS]:
             yield gap, self._asked
 
-    def _read(self, period: Period, ahead: list[int], cut: int) -> list[int]:
+    def _read(self, reading: Reading, period: Period, ahead: list[int]) -> list[int]:
         """Read what the loop has read; return the gaps that the tick may have, the likeliest first."""
         self._tick["rx_flags"] = 0
-        read, left = period.answers[:cut], period.answers[cut:]
+        frames = [*self._left, *period.late, *period.answers]
+        late, read, self._left = (
+            frames[: reading.sync],
+            frames[reading.sync : reading.end],
+            frames[reading.end :],
+        )
         self._read_ns = read[-1].t_ns if read else -1
         if self.roles.sync is None:
-            self.tape.lay([*self._left, *read])
-            gaps = self._newest(period)
-        else:
-            self.tape.lay([*self._left, *period.late])
-            self._client.sync(self._tick)
             self.tape.lay(read)
-            self._drive.receive(self._tick, FAR_NS)
-            gaps = self._grid.gaps(period.t_ns, ahead, self._arrived_ns)
-        self._left = left
-        return gaps
+            return self._newest(period)
+        self.tape.lay(late)
+        self._client.sync(self._tick)
+        self.tape.lay(read)
+        self._drive.receive(self._tick, FAR_NS)
+        return self._grid.gaps(period.t_ns, ahead, self._arrived_ns)
 
     def _newest(self, period: Period) -> list[int]:
         """Take measurements as the loop does that waits for them: the newest counts, others are skipped.
 
         When the loop had read is known where it has read something, else as late as the command allows.
         """
-        tick, heard, jumped = self._tick, 0, 0
+        tick, heard = self._tick, 0
         self._drive.receive(tick, FAR_NS)
         while int(tick["rx_flags"]) & RxFlag.FRESH:
             heard += 1

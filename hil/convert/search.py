@@ -8,6 +8,7 @@ way, one of the choices before it is made another way, and what follows is gone 
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
@@ -20,8 +21,11 @@ from hil.signals import Request, RxFlag, TickArray, ticks_from
 
 WINDOW: Final = 300
 """Ticks that may still be taken back: as many periods as the longest wait with a held command, and more."""
-TRIES: Final = 15_000
-"""Runs of a tick that the search for one way on may take; about 1 s."""
+CONFIRM: Final = 10
+"""Ticks that another choice should lead through, from the one that did not fit."""
+NEAR: Final = 5
+TRIES: Final = 10_000
+"""Runs of a tick that the search for one way on may take; 1 to 2 s."""
 
 
 class NotOursError(HilError):
@@ -47,7 +51,7 @@ class Taken(NamedTuple):
         """Whether its choice is an everyday one: a measurement in time, a period after the last."""
         tick = self.ticks[0]
         good = int(tick["rx_flags"]) & (RxFlag.FRESH | COUNTER_JUMP) == RxFlag.FRESH
-        return good and tick["gap"] == 1 and tick["request"] == Request.ARM
+        return bool(good and tick["gap"] == 1 and tick["request"] == Request.ARM)
 
 
 class Search:
@@ -56,28 +60,39 @@ class Search:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._taken: deque[Taken] = deque()
+        self._coming: deque[tuple[Period, list[int]]] = deque()
 
     def ticks(self, found: Iterable[Period]) -> Iterator[TickArray]:
         """Each tick once it is certain; one that the recording's end cuts off is left out.
 
         Raises NotOursError.
         """
-        for period, ahead in with_ahead(found, self._run.period_ns):
-            if not (period.closed or period.commands):
-                break
-            self._take(period, ahead)
-            if len(self._taken) > WINDOW:
+        whole = (one for one in with_ahead(found, self._run.period_ns) if one[0].closed or one[0].commands)
+        self._coming.extend(itertools.islice(whole, CONFIRM))
+        while self._coming and not self._run.over:
+            self._take()
+            self._coming.extend(itertools.islice(whole, CONFIRM - len(self._coming)))
+            while len(self._taken) > WINDOW:
                 yield self._taken.popleft().ticks
-            if self._run.over:
-                break
         while self._taken:
             yield self._taken.popleft().ticks
 
-    def _take(self, period: Period, ahead: list[int]) -> None:
-        taken = self._first(period, ahead) or self._go_back(period, ahead)
-        if not taken:
-            raise NotOursError(f"at {period.t_ns * 1e-9:.6f} s this controller sends something else")
-        self._taken.append(taken)
+    def _take(self) -> None:
+        """Take the period that comes; where it fits in no way, make another choice before it."""
+        if taken := self._first(*self._coming[0]):
+            self._taken.append(taken)
+            self._coming.popleft()
+            return
+        at, others = self._another_way()
+        if not others:
+            t_ns = self._coming[0][0].t_ns
+            raise NotOursError(f"at {t_ns * 1e-9:.6f} s this controller sends something else")
+        for _ in range(at + len(others) - len(self._taken)):
+            self._coming.popleft()
+        while len(self._taken) > at:
+            self._taken.pop()
+        self._taken += others
+        self._again(others[-1])
 
     def _first(self, period: Period, ahead: list[int]) -> Taken | None:
         """The likeliest way to take a period, from where the run stands."""
@@ -86,23 +101,28 @@ class Search:
             return Taken(before, period, ahead, 0, self._run.ticks.tobytes())
         return None
 
-    def _go_back(self, period: Period, ahead: list[int]) -> Taken | None:
-        """Take a period that fits in no way after another choice before it; those between are taken anew."""
-        most = self._run.tries + TRIES
-        newest_first = range(len(self._taken) - 1, -1, -1)
-        for at in sorted(newest_first, key=lambda at: self._taken[at].sure):
-            for other in self._otherwise(self._taken[at]):
-                later = self._go_on(at, period, ahead)
-                if later:
-                    while len(self._taken) > at:
-                        self._taken.pop()
-                    self._taken += [other, *later[:-1]]
-                    return later[-1]
+    def _another_way(self) -> tuple[int, list[Taken]]:
+        """The place of a choice that is made another way, and the ticks from there on that then fit.
+
+        Of those that lead past the period that comes the first that leads on to the end of what is known, or
+        else the one that leads furthest; no ticks when there is none. The last few choices come first, then
+        those that stamps leave open, then the others; of each the newest first.
+        """
+        most, best = self._run.tries + TRIES, (0, list[Taken]())
+        reached, end = len(self._taken), len(self._taken) + len(self._coming)
+        newest_first = range(reached - 1, -1, -1)
+        for at in sorted(newest_first, key=lambda at: at < reached - NEAR and self._taken[at].sure):
+            for other in self._others(self._taken[at]):
+                ticks = [other, *self._go_on(at + 1)]
+                if at + len(ticks) > reached:
+                    reached, best = at + len(ticks), (at, ticks)
+                    if reached == end or self._run.over:
+                        return best
             if self._run.tries > most:
                 break
-        return None
+        return best
 
-    def _otherwise(self, taken: Taken) -> Iterator[Taken]:
+    def _others(self, taken: Taken) -> Iterator[Taken]:
         """The other ways to take a tick; the run stands after each."""
         before, period, ahead, own, _ = taken
         self._run.restore(before)
@@ -110,13 +130,17 @@ class Search:
             if way != own:
                 yield Taken(before, period, ahead, way, self._run.ticks.tobytes())
 
-    def _go_on(self, at: int, period: Period, ahead: list[int]) -> list[Taken]:
-        """The ticks after place ``at`` up to a period, by first choices; none when one fits in no way."""
-        later: list[Taken] = []
-        between = [(self._taken[i].period, self._taken[i].ahead) for i in range(at + 1, len(self._taken))]
-        for one in [*between, (period, ahead)]:
-            taken = self._first(*one)
+    def _go_on(self, place: int) -> Iterator[Taken]:
+        """The ticks from a place on by first choices, up to one that does not fit or ends the run."""
+        between = ((taken.period, taken.ahead) for taken in itertools.islice(self._taken, place, None))
+        for period, ahead in itertools.chain(between, self._coming):
+            taken = None if self._run.over else self._first(period, ahead)
             if taken is None:
-                return []
-            later.append(taken)
-        return later
+                return
+            yield taken
+
+    def _again(self, taken: Taken) -> None:
+        """Let the run stand after a tick that was taken."""
+        self._run.restore(taken.before)
+        ways = self._run.take(taken.before, taken.period, taken.ahead)
+        next(itertools.islice(ways, taken.way, None))
