@@ -12,6 +12,8 @@ EARLY_SHARE: Final = 10
 """No stamp is taken to be earlier than its deadline by more than this part of a period,"""
 TIGHT_SHARE: Final = 50
 """and none that the grid has been set back to by more than this."""
+HELD_SHARE: Final = 4
+"""Part of a period that a loop takes at most between waking and SYNC, unless it is held up."""
 AHEAD: Final = 4
 BURST: Final = 3
 MERGE_PERIODS: Final = 5
@@ -238,12 +240,13 @@ class Grid:
     def gaps(self, t_ns: int, ahead: Iterable[int], since_ns: int) -> list[int]:
         """:meth:`gap` and what else it may be, the likeliest first. ``since_ns``: the last tick's last frame.
 
-        The loop woke between the two stamps. Where the stamps ahead say that SYNC came later than that, it
+        The loop woke between the two. Where the stamps ahead say that SYNC came much later than that, it
         was held up after it woke, and then most likely had woken on time.
         """
         most = self.gap(t_ns, ahead)
         least = min(max(1, self._since(since_ns, TIGHT_SHARE)), most) if self.k >= 0 else 1
-        return around(least if most < self._since(t_ns, TIGHT_SHARE) else most, least, most)
+        held = most < self._since(t_ns - self._period_ns // HELD_SHARE, TIGHT_SHARE)
+        return around(least if held else most, least, most)
 
     def _since(self, t_ns: int, share: int) -> int:
         """Periods from the last tick's deadline to a stamp that may be early by a share of one."""

@@ -94,6 +94,7 @@ class Before(NamedTuple):
     left: list[Heard]
     grid: tuple[int, int, int, int]
     arrived_ns: int
+    reply_ns: int
     asked: int
 
 
@@ -118,7 +119,7 @@ class Run:
         self.period_ns = config.loop.period_ns
         self._grid = Grid(self.period_ns)
         self._left: list[Heard] = []
-        self._since_ns = self._read_ns = self._arrived_ns = 0
+        self._read_ns = self._arrived_ns = self._reply_ns = 0
         self._asked = int(Request.ARM)
         self.tries = 0
 
@@ -131,6 +132,7 @@ class Run:
             self._left,
             self._grid.saved(),
             self._arrived_ns,
+            self._reply_ns,
             self._asked,
         )
 
@@ -141,7 +143,8 @@ class Run:
         self._client.restore(before.client)
         self.tape.restore(before.queue)
         self._grid.restore(before.grid)
-        self._left, self._arrived_ns, self._asked = before.left, before.arrived_ns, before.asked
+        self._left, self._asked = before.left, before.asked
+        self._arrived_ns, self._reply_ns = before.arrived_ns, before.reply_ns
 
     def take(self, before: Before, period: Period, ahead: list[int]) -> Iterator[None]:
         """Run the tick of a period once for each way in which this controller sends what was recorded.
@@ -211,7 +214,8 @@ class Run:
     def _newest(self, period: Period) -> list[int]:
         """Take measurements as the loop does that waits for them: the newest counts, others are skipped.
 
-        When the loop had read is known where it has read something, else as late as the command allows.
+        When the loop had read is known where it has read something; else it was as late before the command as
+        it was last time.
         """
         tick, heard = self._tick, 0
         self._drive.receive(tick, FAR_NS)
@@ -227,10 +231,12 @@ class Run:
         due_ns = self._arrived_ns + self.period_ns
         least_ns = max(self._read_ns, due_ns if heard else due_ns + self.period_ns // 2)
         most_ns = max(period.sent_ns, least_ns)
-        least, most = (
-            1 + missed(heard, jumped, now_ns - due_ns, self.period_ns) for now_ns in (least_ns, most_ns)
+        likely_ns = least_ns if heard else max(most_ns - self._reply_ns, least_ns)
+        likely, least, most = (
+            1 + missed(heard, jumped, now_ns - due_ns, self.period_ns)
+            for now_ns in (likely_ns, least_ns, most_ns)
         )
-        return around(least if heard else most, least, most)
+        return around(likely, least, most)
 
     def _step(self, period: Period, gap: int, request: int) -> None:
         self.ticks["gap"], self.ticks["request"] = gap, request
@@ -280,5 +286,6 @@ class Run:
             self._arrived_ns = max(period.t_ns, period.answered_ns, period.sent_ns)
         elif fresh or self._grid.k < 0:
             self._arrived_ns = self._read_ns if self._read_ns >= 0 else period.t_ns
+            self._reply_ns = min(max(period.sent_ns - self._arrived_ns, 0), self.period_ns // 4)
         else:
             self._arrived_ns += gap * self.period_ns
