@@ -5,10 +5,13 @@ runs over what it makes of them. Its commands are compared with the recorded one
 same, the recording is of this controller, and the log is that of its run. Are they not, it is a log of a
 shadow run: somebody else closed the loop, and what this controller would have done is open loop.
 
-What is not on the wire: the deadlines (SYNC's stamps stand in, on a grid of the period), the phases within a
-tick but for SYNC, feedback and command, what the operator asked (found by trying what he can ask), what the
-log's own writer or the guardian told the loop, and every output but the command (computed anew). Nor is a
-period that was skipped while the drive was being enabled, where no command depends on it and SYNC was late.
+What is not on the wire: the deadlines (SYNC's stamps stand in, on a grid of the period), the phases within
+a tick but for SYNC, feedback and command, what the log's own writer or the guardian told the loop, and every
+output but the command (computed anew). How many periods were skipped before a tick, what the operator asked
+and what had been read by the time of the command is not there either, but the commands prove it, and a wrong
+guess is taken back once a later one shows it (:mod:`hil.convert.search`). Where no command depends on it the
+guess by the stamps stands: at periods skipped while the drive is being enabled or stopped, at their place
+within a stretch of held commands, and in a listener's recording at the tick that took a status frame.
 """
 
 from __future__ import annotations
@@ -141,8 +144,6 @@ def _carry(setup: Setup, recording: Recording, part: Path, out: Path, why: str =
         loop = setup.config.loop
         passing = output.passing(itertools.chain([first], frames))
         found = periods(passing, run.roles, loop.timeout_ns, loop.period_ns, merge)
-        if not run.shadow:  # a drive that sends by its own clock was there before this controller
-            found = itertools.dropwhile(lambda period: not period.commands, found)
         for ticks in Search(run).ticks(found):
             output.tick(ticks)
         for _ in passing:

@@ -198,9 +198,9 @@ def _stamps(window: deque[Period], period_ns: int) -> list[int]:
 
 
 def around(first: int, least: int, most: int) -> list[int]:
-    """Gaps to be tried: ``first``, the ends of what stamps leave open, beside it, none, what is between."""
+    """Gaps to be tried: ``first``, the ends of what the stamps leave open, beside it, what is between."""
     between = range(least, min(most + 1, least + GAPS_MOST))
-    return [gap for gap in dict.fromkeys([first, least, most, first - 1, first + 1, 1, *between]) if gap > 0]
+    return [gap for gap in dict.fromkeys([first, least, most, first - 1, first + 1, *between]) if gap > 0]
 
 
 class Grid:

@@ -65,10 +65,15 @@ class Search:
     def ticks(self, found: Iterable[Period]) -> Iterator[TickArray]:
         """Each tick once it is certain; one that the recording's end cuts off is left out.
 
-        Raises NotOursError.
+        A drive that sends by its own clock was there before this controller: what came before the first
+        command is not of its run. Raises NotOursError.
         """
+        if not self._run.shadow:
+            found = itertools.dropwhile(lambda period: not period.commands, found)
         whole = (one for one in with_ahead(found, self._run.period_ns) if one[0].closed or one[0].commands)
         self._coming.extend(itertools.islice(whole, CONFIRM))
+        if not self._coming and not self._run.shadow:
+            raise NotOursError("there is no command")
         while self._coming and not self._run.over:
             self._take()
             self._coming.extend(itertools.islice(whole, CONFIRM - len(self._coming)))
