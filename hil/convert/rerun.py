@@ -201,7 +201,8 @@ class Run:
             frames[reading.sync : reading.end],
             frames[reading.end :],
         )
-        self._read_ns = read[-1].t_ns if read else -1
+        measured = (frame.t_ns for frame in reversed(read) if frame.can_id in self.roles.measuring)
+        self._read_ns = next(measured, -1)
         if self.roles.sync is None:
             self.tape.lay(read)
             return self._newest(period)
@@ -214,7 +215,7 @@ class Run:
     def _newest(self, period: Period) -> list[int]:
         """Take measurements as the loop does that waits for them: the newest counts, others are skipped.
 
-        When the loop had read is known where it has read something; else it was as late before the command as
+        When the loop had read is known where it took a measurement; else it was as late before the command as
         it was last time.
         """
         tick, heard = self._tick, 0
