@@ -229,6 +229,8 @@ class Run:
         if self._grid.k < 0:
             return [1]
         jumped = int(tick["rx_flags"]) & COUNTER_JUMP
+        if heard and not jumped and self._setup.config.loop.pacing == "feedback":
+            return [heard]
         due_ns = self._arrived_ns + self.period_ns
         least_ns = max(self._read_ns, due_ns if heard else due_ns + self.period_ns // 2)
         most_ns = max(period.sent_ns, least_ns)

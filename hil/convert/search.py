@@ -24,8 +24,10 @@ WINDOW: Final = 300
 CONFIRM: Final = 10
 """Ticks that another choice should lead through, from the one that did not fit."""
 NEAR: Final = 5
-TRIES: Final = 10_000
-"""Runs of a tick that the search for one way on may take; 1 to 2 s."""
+TRIES: Final = 7_000
+"""Runs of a tick that the search for one way on may take with one choice made another way;"""
+DEEP, DEEP_TRIES = 4, 3_000
+"""and with any choices of the last ticks. Both together take 1 to 2 s."""
 
 
 class NotOursError(HilError):
@@ -125,7 +127,33 @@ class Search:
                         return best
             if self._run.tries > most:
                 break
+        return best if best[1] else self._any_way(max(0, reached - DEEP))
+
+    def _any_way(self, at: int) -> tuple[int, list[Taken]]:
+        """As :meth:`_another_way`, with any choices from a place on: two hold-ups in a row take two."""
+        best, most = (at, list[Taken]()), self._run.tries + DEEP_TRIES
+        if at < len(self._taken):
+            self._run.restore(self._taken[at].before)
+            for ticks in self._ways_from(at, most):
+                best = max(best, (at, ticks), key=lambda one: len(one[1]))
+                if at + len(best[1]) == len(self._taken) + len(self._coming) or self._run.over:
+                    break
         return best
+
+    def _ways_from(self, place: int, most: int) -> Iterator[list[Taken]]:
+        """The ways from a place on that lead past the period that comes, the last choices varied first."""
+        if place > len(self._taken):
+            yield list(self._go_on(place))
+            return
+        one = self._taken[place] if place < len(self._taken) else None
+        period, ahead = (one.period, one.ahead) if one else self._coming[0]
+        before = self._run.before()
+        for way, _ in enumerate(self._run.take(before, period, ahead)):
+            taken = Taken(before, period, ahead, way, self._run.ticks.tobytes())
+            for later in self._ways_from(place + 1, most):
+                yield [taken, *later]
+            if self._run.tries > most:
+                return
 
     def _others(self, taken: Taken) -> Iterator[Taken]:
         """The other ways to take a tick; the run stands after each."""
@@ -137,8 +165,8 @@ class Search:
 
     def _go_on(self, place: int) -> Iterator[Taken]:
         """The ticks from a place on by first choices, up to one that does not fit or ends the run."""
-        between = ((taken.period, taken.ahead) for taken in itertools.islice(self._taken, place, None))
-        for period, ahead in itertools.chain(between, self._coming):
+        taken_before = ((taken.period, taken.ahead) for taken in self._taken)
+        for period, ahead in itertools.islice(itertools.chain(taken_before, self._coming), place, None):
             taken = None if self._run.over else self._first(period, ahead)
             if taken is None:
                 return

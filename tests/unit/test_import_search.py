@@ -19,7 +19,7 @@ from drivers.mapping import MEASURED
 from hil.app import Overrides, Setup, load_setup
 from hil.convert.periods import HELD_PERIODS, Heard, periods
 from hil.convert.rerun import FAR_NS, Run, Tape, roles_of
-from hil.convert.search import TRIES, NotOursError, Search
+from hil.convert.search import DEEP_TRIES, TRIES, NotOursError, Search
 from hil.loop import Loop, Plan, StopRequest
 from hil.signals import FIELDS, DriveState, RxFlag, TickArray, new_ticks
 from tests.conftest import CONFIGS
@@ -281,7 +281,7 @@ def test_a_command_that_nothing_explains_ends_the_search_soon(hold: Hold) -> Non
     measured_ns = next(f.t_ns for f in reversed(frames[:place]) if f.received)
     with pytest.raises(NotOursError, match=f"at {measured_ns * 1e-9:.6f} s this controller sends"):
         list(ticks)
-    assert run.tries < 150 + TRIES * 11 // 10
+    assert run.tries < 150 + (TRIES + DEEP_TRIES) * 11 // 10
 
 
 def test_a_pause_in_the_recording_is_bounded_work() -> None:
@@ -292,7 +292,7 @@ def test_a_pause_in_the_recording_is_bounded_work() -> None:
     run, ticks = found([*world.own[:place], *late], setup_of("demo.toml"))
     with pytest.raises(NotOursError):
         list(ticks)
-    assert run.tries < 300 + TRIES * 11 // 10
+    assert run.tries < 300 + (TRIES + DEEP_TRIES) * 11 // 10
 
 
 def test_a_drive_that_was_there_before_the_controller() -> None:
