@@ -467,6 +467,7 @@ def _run_armed(
         with stopping_on_signals(request):
             note_interface(setup.config, recorder, clock.now_ns(), 0)
             if clock.name == "monotonic":
+                realtime.keep_off(recorder.writer_pid, setup.config.realtime.cpu)
                 grants = realtime.acquire(setup.config.realtime)
             bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
             entry = own_entry(recorder.path, f"{bus.interface}:{bus.channel}", rate_hz, plan.ticks)

@@ -5,6 +5,7 @@ Nothing here fails: what is not granted is said, with what would grant it.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -76,6 +77,14 @@ def _core(cpu: int | None) -> list[Grant]:
     except OSError as error:
         return [Grant("core", False, f"core {cpu}: {error.strerror}; choose another [realtime] cpu")]
     return [Grant("core", True, f"pinned to core {cpu}")]
+
+
+def keep_off(pid: int, cpu: int | None) -> None:
+    """Keep another process off the loop's core, where there is another core for it."""
+    others = os.sched_getaffinity(0) - {cpu}
+    if cpu is not None and others:
+        with contextlib.suppress(OSError):  # it has gone, which the loop sees by itself
+            os.sched_setaffinity(pid, others)
 
 
 def freeze_collector() -> Grant:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from hil.app import Overrides, Setup, compile_kernels, is_emulated_bus, load_setup
 from hil.bench.machine import resident_kib
@@ -52,11 +53,25 @@ class Stand:
         return replace(self.overrides, settings=(*self.overrides.settings, *more))
 
 
-def share_in_time(ticks: TickArray, rate_hz: int) -> float:
-    """Share of the periods in which the command went out before the next deadline, on fresh feedback."""
+def in_time(ticks: TickArray, rate_hz: int) -> npt.NDArray[np.bool_]:
+    """Which ticks' commands went out before the next deadline, on fresh feedback."""
     fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
-    good = np.count_nonzero(fresh & (ticks["sent_ns"] < 1_000_000_000 // rate_hz))
+    return np.asarray(fresh & (ticks["sent_ns"] < 1_000_000_000 // rate_hz))
+
+
+def share_in_time(ticks: TickArray, rate_hz: int) -> float:
+    """Share of all periods, the skipped ones too, whose tick was :func:`in_time`."""
+    good = np.count_nonzero(in_time(ticks, rate_hz))
     return float(good) / max(1, int(ticks["k"][-1]) + 1) if len(ticks) else 0.0
+
+
+def seconds_in_time(ticks: TickArray, rate_hz: int) -> list[float]:
+    """:func:`share_in_time` of each whole second."""
+    if not len(ticks):
+        return []
+    second = ticks["k"][in_time(ticks, rate_hz)] // rate_hz
+    whole = (int(ticks["k"][-1]) + 1) // rate_hz
+    return [float(np.count_nonzero(second == place)) / rate_hz for place in range(whole)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +124,26 @@ def stand(path: Path, overrides: Overrides) -> Iterator[Stand]:
             if drive_core is not None:
                 os.sched_setaffinity(pid, {drive_core})
             yield one
+
+
+@contextlib.contextmanager
+def awake(wanted: bool) -> Iterator[None]:
+    """Keep every core from idling, as the kernel's idle=poll would, by processes that give way to all others.
+
+    A virtual machine that idles is given back to the host, and gets its processor again when the host likes.
+    """
+    command = [sys.executable, "-c", "while True: pass"]
+    spinning: list[subprocess.Popen[bytes]] = []
+    try:
+        for core in sorted(os.sched_getaffinity(0)) if wanted else ():
+            spinning.append(subprocess.Popen(command))
+            os.sched_setaffinity(spinning[-1].pid, {core})
+            os.sched_setscheduler(spinning[-1].pid, os.SCHED_IDLE, os.sched_param(0))
+        yield
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
 
 
 def two_cores(wanted: int | None) -> tuple[int | None, int | None]:

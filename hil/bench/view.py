@@ -66,7 +66,7 @@ def _cost(result: dict[str, Any]) -> str:
 def _rate(result: dict[str, Any]) -> str:
     ratio = result["rate_ratio"]
     text = f"{ratio:.2f} x the bare loop's: " if ratio is not None else ""
-    text += f"{result['rate_hz']} Hz of {result['bare_rate_hz']} Hz with 99.9 % of the ticks in time"
+    text += f"{result['rate_hz']} Hz of {result['bare_rate_hz']} Hz, 99.9 % in time in the best second"
     return text if result["tried"] else text + " (other rates not tried)"
 
 

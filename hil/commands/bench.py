@@ -20,6 +20,9 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "--quick", action="store_true", help="seconds instead of minutes; no search of rates"
     )
+    command.add_argument(
+        "--awake", action="store_true", help="keep the cores from idling, as the kernel's idle=poll does"
+    )
     command.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json output: show ratios")
     command.add_argument("-o", "--output", type=Path, metavar="DIR", help="write lateness.png and bench.html")
 
@@ -35,7 +38,7 @@ def cmd_bench(args: argparse.Namespace) -> int:
     earlier = read_result(args.compare) if args.compare else None
     out = output_folder(args.output) if args.output else None
     path = args.config or find_config("demo.toml")
-    done = bench(path, overrides(args), QUICK if args.quick else FULL, say)
+    done = bench(path, overrides(args), QUICK if args.quick else FULL, say, keep_awake=args.awake)
     result = done.result
     if earlier is not None:
         result["compared"] = ratios(result, earlier)

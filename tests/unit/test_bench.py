@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections import Counter
 from itertools import pairwise
@@ -17,6 +18,7 @@ from hil.bench.histogram import TOP_US, Histogram
 from hil.bench.machine import machine_facts, resident_kib
 from hil.bench.measure import TRIES, highest, phases, rates_that_hold
 from hil.bench.meter import LOOP, Meter
+from hil.bench.processes import awake, seconds_in_time, share_in_time
 from hil.bench.view import ratios, read_result
 from hil.errors import HilError
 from hil.signals import new_ticks
@@ -92,21 +94,47 @@ def test_the_highest_rate_is_found_with_few_tries(limit: int) -> None:
 
 
 def test_a_stall_that_spoils_a_probe_does_not_decide_on_a_rate() -> None:
-    """Each rate has three probes, of which one must hold; the first that does is the last."""
+    """Each rate has three probes, in one of which a second must hold; the first such probe is the last."""
     top, spoiled, asked = {"hil": 4000, "bare": 5000}, {("hil", 4000): 2, ("bare", 5000): 3}, Counter[Any]()
 
-    def probe(loop: str, rate_hz: int) -> float:
+    def probe(loop: str, rate_hz: int) -> list[float]:
         asked[loop, rate_hz] += 1
-        return (
-            0.9995
-            if rate_hz <= top[loop] and asked[loop, rate_hz] > spoiled.get((loop, rate_hz), 0)
-            else 0.99
-        )
+        quiet = asked[loop, rate_hz] > spoiled.get((loop, rate_hz), 0)
+        return [0.99, 0.9995 if quiet and rate_hz <= top[loop] else 0.98]
 
     found, tried = rates_that_hold([2000, 3000, 4000, 5000, 6000], probe)
     assert found == {"hil": 4000, "bare": 4000}
     assert asked["hil", 4000] == TRIES and asked["bare", 5000] == TRIES and asked["bare", 4000] == 1
-    assert len(tried) == asked.total() and {one["in_time"] for one in tried} == {0.9995, 0.99}
+    assert len(tried) == asked.total() and {max(one["in_time"]) for one in tried} == {0.9995, 0.99}
+
+
+def test_seconds_in_time_count_skipped_periods_and_leave_out_a_part() -> None:
+    ticks = new_ticks(2300)
+    ticks["k"] = np.concatenate([np.arange(990), np.arange(1000, 2310)])  # ten periods skipped in the first
+    ticks["rx_flags"], ticks["sent_ns"] = 1, 900_000
+    ticks["sent_ns"][1500:1520] = 1_000_000
+    ticks["rx_flags"][1600] = 0
+    assert seconds_in_time(ticks, 1000) == [0.99, 0.979]
+    assert share_in_time(ticks, 1000) == pytest.approx((2300 - 21) / 2310)
+    assert seconds_in_time(new_ticks(0), 1000) == [] and share_in_time(new_ticks(0), 1000) == 0.0
+
+
+def children() -> set[int]:
+    lists = Path("/proc/self/task").glob("*/children")
+    return {int(pid) for one in lists for pid in one.read_text().split()}
+
+
+def test_cores_are_kept_awake_by_what_gives_way_to_all_others() -> None:
+    before = children()
+    with awake(False):
+        assert children() == before
+    with awake(True):
+        spinning = children() - before
+        assert {os.sched_getscheduler(pid) for pid in spinning} == {os.SCHED_IDLE}
+        assert {frozenset(os.sched_getaffinity(pid)) for pid in spinning} == {
+            frozenset({core}) for core in os.sched_getaffinity(0)
+        }
+    assert children() == before
 
 
 def test_phases_are_differences_of_the_stamps() -> None:
