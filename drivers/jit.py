@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+import numpy.typing as npt
 from numba import types
 from numba.core import cgutils
 from numba.core import config as numba_config
@@ -74,6 +76,15 @@ def place_of(array: Any, dtype: Any) -> tuple[int, int]:
     return array.__array_interface__["data"][0], len(array)
 
 
+def places_of(arrays: Mapping[str, Any], kinds: Mapping[str, Any]) -> npt.NDArray[np.int64]:
+    """:func:`place_of` for each of ``kinds`` in their order, 0 where there is no array of the name."""
+    places = np.zeros((len(kinds), 2), np.int64)
+    for index, (name, dtype) in enumerate(kinds.items()):
+        if (array := arrays.get(name)) is not None:
+            places[index] = place_of(array, dtype)
+    return places
+
+
 def _to_pointer(_typing: Any, address: Any) -> Any:
     """A pointer from its address."""
 
@@ -88,7 +99,7 @@ _behind: Any = intrinsic(_to_pointer)
 
 @jit
 def array_at(places: Any, index: int, dtype: Any) -> Any:
-    """The array at a place: row ``index`` of an array of what :func:`place_of` returned.
+    """The array at a place: row ``index`` of what :func:`places_of` returned.
 
     To unpack an array of numpy's costs a kernel of a few microseconds most of its time, above all from a cold
     cache; it unpacks one of places instead. Compiled code only: the interpreter can't follow an address.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from drivers.bus import SocketLink
-from drivers.jit import entry
-from drivers.posix import DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, exchange, places_of
+from drivers.jit import entry, places_of
+from drivers.posix import ARRAYS, DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, exchange
 
 Arrays = dict[str, Any]
 """What :data:`drivers.posix.ARRAYS` names."""
@@ -30,8 +30,8 @@ class SocketPort:
         arrays = self._shared | own
         self._alive[kernel] = arrays
         nowhere = np.full(4, -1, np.int32)
-        compiled = entry(kernel, places_of(arrays | {"fds": nowhere}), *known, *free)
-        return partial(compiled, places_of(arrays), *known)
+        compiled = entry(kernel, places_of(arrays | {"fds": nowhere}, ARRAYS), *known, *free)
+        return partial(compiled, places_of(arrays, ARRAYS), *known)
 
     def drainer(self, own: Arrays, flags_at: int) -> Callable[[int, bool], int]:
         """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; the tick's flags' offset."""

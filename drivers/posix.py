@@ -5,8 +5,8 @@ frame, each handed to :func:`drivers.wire.take`. What it can't judge itself it h
 calls again to go on. The symbols are the process's own (POSIX), so that the compiled form can be cached.
 
 To unpack an array of numpy's at every call costs more than what most kernels here do with it. Those that a
-tick calls take one array instead: the places (address and length) of all the others, as :func:`places_of`
-writes them down.
+tick calls take one array instead: the places (address and length) of all the others, as
+:func:`drivers.jit.places_of` writes them down.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from typing import Any, Final
 
 import numba
 import numpy as np
-import numpy.typing as npt
 from numba import types
 
 from drivers.frames import FRESH
-from drivers.jit import array_at, jit, place_of, waiting
+from drivers.jit import array_at, jit, waiting
 from drivers.states import ENABLE_OPERATION, FAULT_RESET
 from drivers.wire import DATA_AT, FRAME, MESSAGE, REFUSED, SIGNAL, STATE, STATE_RAW, encode, note, take
 
@@ -58,15 +57,6 @@ ARRAYS: Final = {
 kernels here, the others of :mod:`drivers.wire`."""
 FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST, STATES, WORDS, TICK, LOG, FIELDS, SYNC = range(14)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
-
-
-def places_of(arrays: dict[str, Any]) -> npt.NDArray[np.int64]:
-    """Address and length of each array, 0 where there is none; they must outlive it. Raises TypeError."""
-    places = np.zeros((len(ARRAYS), 2), np.int64)
-    for index, (name, dtype) in enumerate(ARRAYS.items()):
-        if (array := arrays.get(name)) is not None:
-            places[index] = place_of(array, dtype)
-    return places
 
 
 @jit

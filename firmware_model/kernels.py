@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, Final
 
 from firmware_model.config import Record
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
-from firmware_model.jit import COMPILED, array_at, entry, jit, place_of
+from firmware_model.jit import COMPILED, array_at, entry, jit, places_of
 from firmware_model.plant import PARAMS, SAMPLE, STATE
+
+ARRAYS: Final = {"params": PARAMS, "state": STATE, "sample": SAMPLE}
+"""The records behind a kernel's places, in their order."""
 
 
 class Kernels:
@@ -30,7 +30,7 @@ class Kernels:
     load: Callable[[float], None]
 
     def __init__(self, params: Record, state: Record, sample: Record) -> None:
-        self._alive = params, state, sample
+        self._alive = {"params": params, "state": state, "sample": sample}
         self.state: Any = state[0]
         self.sample: Any = sample[0]
         if not COMPILED:
@@ -38,8 +38,8 @@ class Kernels:
             self.sync = partial(on_sync, params[0], self.state, self.sample)
             self.command, self.load = partial(on_command, self.state), partial(on_load_command, self.state)
             return
-        copies = params, state.copy(), sample.copy()
-        trial, places = places_of(*copies), places_of(*self._alive)
+        copies = {"params": params, "state": state.copy(), "sample": sample.copy()}
+        trial, places = places_of(copies, ARRAYS), places_of(self._alive, ARRAYS)
         self.advance = partial(entry(advance_at, trial, 0), places)
         self.sync = partial(entry(on_sync_at, trial), places)
         self.command = partial(entry(on_command_at, trial, 0, 0, 0.0, 0.0), places)
@@ -48,11 +48,6 @@ class Kernels:
     def sampled(self) -> dict[str, Any]:
         """The sample as plain numbers."""
         return dict(zip(SAMPLE.names or (), self.sample.item(), strict=True))
-
-
-def places_of(params: Record, state: Record, sample: Record) -> npt.NDArray[np.int64]:
-    """Where the records are, which must outlive the use."""
-    return np.array([place_of(params, PARAMS), place_of(state, STATE), place_of(sample, SAMPLE)], np.int64)
 
 
 @jit

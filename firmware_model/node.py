@@ -151,9 +151,8 @@ class Node:
         """Take a frame, if there is one, else the time that has passed."""
         if frame is not None:
             self.take(frame)
-        if (
-            frame is None or time.monotonic_ns() - self._cells[LAST_NS] > IDLE_NS
-        ):  # a flood must not stop the plant
+        flooded = time.monotonic_ns() - self._cells[LAST_NS] > IDLE_NS  # which must not stop the plant
+        if frame is None or flooded:
             self._catch_up()
 
     def _bus_down(self) -> None:

@@ -18,7 +18,6 @@ import numpy.typing as npt
 from drivers.binding import Bound
 from drivers.bus import Link, SocketLink
 from drivers.codec import Message
-from drivers.jit import waiting
 from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, transmit, wait
 from drivers.tables import Tables, laid_out
 from drivers.wire import (
@@ -39,7 +38,7 @@ from drivers.wire import STATE as WIRE_STATE
 from firmware_model.config import Record
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
 from firmware_model.house import FIRST_ANSWER, VOLTAGE_MODE, HouseFrames
-from firmware_model.jit import COMPILED, array_at, entry, jit, place_of
+from firmware_model.jit import COMPILED, array_at, entry, jit, places_of, waiting
 from firmware_model.plant import PARAMS, SAMPLE, STATE
 
 IDLE_NS: Final = 5_000_000
@@ -52,17 +51,13 @@ LAST_NS, STARTED, UNSENT, SYNC_ID, PERIOD_NS = range(5)
 configuration, the identifier of SYNC and the period of lockstep, 0 in real time."""
 VOLTAGE, LOAD, STATUS = 1, 2, 4
 """What a message carries, as bits."""
-_COMMAND: Final = {
-    "Mode": 1,
-    "Controlword": 2,
-    "VoltageQ": 3,
-    "VoltageD": 4,
-    "LoadEnable": 5,
-    "LoadTorque": 6,
-}
-_LOAD: Final = {"Enable": 5, "LoadTorque": 6}
-"""Places of a command's signals among the values; its counter has the first."""
 _MODE, _CONTROLWORD, _U_Q, _U_D, _ENABLE, _T_L = range(1, 7)
+"""Places of a command's signals among the values; its counter has the first."""
+_COMMAND: Final = {
+    "Mode": _MODE, "Controlword": _CONTROLWORD, "VoltageQ": _U_Q, "VoltageD": _U_D,
+    "LoadEnable": _ENABLE, "LoadTorque": _T_L,
+}  # fmt: skip
+_LOAD: Final = {"Enable": _ENABLE, "LoadTorque": _T_L}
 F8, I8, U1, U4, I4 = (np.dtype(kind) for kind in ("f8", "i8", "u1", "u4", "i4"))
 ARRAYS: Final = {
     "params": PARAMS, "state": STATE, "sample": SAMPLE, "whole": I8, "real": F8, "fields": I8, "values": F8,
@@ -91,17 +86,18 @@ class Station:
         self.cells = np.zeros(5, np.int64)
         self.cells[SYNC_ID], self.cells[PERIOD_NS] = frames.sync_id or 0, period_ns
         self.raw = np.zeros(FD_BYTES + DATA_AT, np.uint8)
-        taken, sent = _taken(frames), _sent(frames)
+        taken, sent, fields = _taken(frames), _sent(frames), _fields(frames)
         heads = [laid_out(message.send_id, message.length, message.fd) for message, _ in frames.answers]
         self._alive = {
             "params": params, "state": state, "sample": sample,
-            "whole": sample.view("i8"), "real": sample.view("f8"), "fields": _fields(frames),
-            "values": np.zeros(64), "fds": link.fds, "times": np.zeros(4, np.int64), "cells": self.cells,
+            "whole": sample.view("i8"), "real": sample.view("f8"), "fields": fields,
+            "values": np.zeros(1 + max(len(fields) // 2, len(_COMMAND))),
+            "fds": link.fds, "times": np.zeros(4, np.int64), "cells": self.cells,
             "counters": frames.counters, "raw": self.raw, "out": np.concatenate(heads),
             "words": np.zeros(2, np.uint32), "wire": np.zeros(1, WIRE_STATE), "log": np.zeros(0, FRAME),
             "taken": taken[0], "taken_signals": taken[1], "sent": sent[0], "sent_signals": sent[1],
         }  # fmt: skip
-        places = _places_of(self._alive)
+        places = places_of(self._alive, ARRAYS)
         self.attend = partial(entry(attend, places, 0), places)
 
 
@@ -116,20 +112,11 @@ def station(
     return Station(link, frames, records, period_ns)
 
 
-def _places_of(arrays: dict[str, Any]) -> npt.NDArray[np.int64]:
-    return np.array([place_of(arrays[name], dtype) for name, dtype in ARRAYS.items()], np.int64)
-
-
 def _taken(frames: HouseFrames) -> tuple[Record, Record]:
     """(messages, signals) of what commands the drive, in the order of their counters."""
     tables = Tables()
-    inline = LOAD if frames.inline_load else 0
-    _add(
-        tables,
-        frames.command,
-        {n: i for n, i in _COMMAND.items() if n in frames.command.signals},
-        VOLTAGE | inline,
-    )
+    has = {name: place for name, place in _COMMAND.items() if name in frames.command.signals}
+    _add(tables, frames.command, has, VOLTAGE | (LOAD if frames.inline_load else 0))
     if frames.load_command:
         _add(tables, frames.load_command, _LOAD, LOAD)
     return tables.records()
@@ -160,18 +147,11 @@ def _fields(frames: HouseFrames) -> npt.NDArray[np.int64]:
 @jit
 def send_answer(places: Any, status_due: int) -> bool:
     """Lay all out, then send: False, and nothing is sent, where a value does not fit its signal."""
-    fds, cells, counters = (
-        array_at(places, _FDS, I4),
-        array_at(places, _CELLS, I8),
-        array_at(places, _COUNTERS, I8),
-    )
+    fds, cells = array_at(places, _FDS, I4), array_at(places, _CELLS, I8)
+    counters, out = array_at(places, _COUNTERS, I8), array_at(places, _OUT, U1)
     messages, signals = array_at(places, _SENT, MESSAGE), array_at(places, _SENT_SIGNALS, SIGNAL)
     whole, real = array_at(places, _WHOLE, I8), array_at(places, _REAL, F8)
-    values, fields, out = (
-        array_at(places, _VALUES, F8),
-        array_at(places, _FIELDS, I8),
-        array_at(places, _OUT, U1),
-    )
+    values, fields = array_at(places, _VALUES, F8), array_at(places, _FIELDS, I8)
     words, wire = array_at(places, _WORDS, U4), array_at(places, _WIRE, WIRE_STATE)
     log = array_at(places, _LOG, FRAME)
     for place in range(len(fields) // 2):

@@ -458,9 +458,7 @@ def _run_armed(
     request: StopRequest,
 ) -> RunResult:
     machine, plan = setup.machine.fresh(), plan_of(setup.config)
-    ticks = new_ticks()
-    recorder.attach(ticks)
-    loop = Loop(drive, clock, recorder, machine.looped(), ticks, plan, request)
+    loop = Loop(drive, clock, recorder, machine.looped(), recorder.record, plan, request)
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:

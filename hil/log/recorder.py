@@ -91,7 +91,7 @@ class Recorder:
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
-        self.attach(new_ticks())  # what is compiled for it is there before the loop
+        self._attach(new_ticks())  # what is compiled for it is there before the loop
         self._failed = self._closed = False
         self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
@@ -157,11 +157,16 @@ class Recorder:
     def tick(self, tick: TickArray) -> None:
         """Store one tick."""
         if tick is not self._record:
-            self.attach(tick)
+            self._attach(tick)
         self._push()
 
-    def attach(self, record: TickArray) -> None:
-        """Be ready to store this very record, so that its first tick takes no longer than the others."""
+    @property
+    def record(self) -> TickArray:
+        """The record that it is ready to store: a loop that writes it has a first tick like the others."""
+        return self._record
+
+    def _attach(self, record: TickArray) -> None:
+        """Be ready to store this very record."""
         self._record, self._push = record, pusher(self._ticks, record)
 
     def frames(self, records: memoryview) -> None:
