@@ -16,6 +16,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
@@ -35,7 +36,20 @@ from drivers.jit import COMPILED, entry
 from drivers.local import CLASSIC, ERR_FLAG, FD
 from drivers.mapping import DriveMap, house_map
 from drivers.port import SocketPort
-from drivers.posix import DRAIN_MOST, FLAGS, PENDING, REFUSED_COMMAND, SEEN, SIZE, UNSENT
+from drivers.posix import (
+    COMMANDED,
+    DRAIN_MOST,
+    EXCHANGED,
+    FLAGS,
+    PENDING,
+    REFUSED_COMMAND,
+    SEEN,
+    SIZE,
+    SYNC_COUNTS,
+    UNSENT,
+    command,
+    exchange,
+)
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
@@ -50,7 +64,7 @@ DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
 Send = Callable[[int], int]
-_GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD = range(6)
+_GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _DOWN = range(9)
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
 _SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
@@ -61,7 +75,18 @@ class Saved(NamedTuple):
 
     state: bytes
     counters: bytes
-    own: tuple[int, int, bool]
+
+
+class Compiled(NamedTuple):
+    """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
+
+    ``exchange`` and ``command`` are places, ``sync_bytes`` the size of SYNC's frame, ``log`` the frames.
+    """
+
+    exchange: npt.NDArray[np.int64]
+    command: npt.NDArray[np.int64]
+    sync_bytes: int
+    log: npt.NDArray[np.void]
 
 
 class Outgoing:
@@ -108,9 +133,7 @@ class DriveClient:
         self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
         self._raw_link = raw_link(link, any(bound.message.fd for bound in self.binding.outgoing))
         self.seen: Counter[int] = Counter()
-        self._sync_counter = 0
-        self._pending_flags = 0
-        self._down = self._late = False
+        self._late = False
         self._tick: Any = None
         foreign = [bound.message for bound in self.binding.outgoing]
         self._foreign = {m.send_id for m in [*foreign, self.binding.sync] if m is not None}
@@ -133,7 +156,7 @@ class DriveClient:
         shared = {"state": self._state, "words": self._words, "log": self._log}
         self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
         self._drain_socket: Callable[[int, bool], int] | None = None
-        self._exchange: Callable[[int, int], int] | None = None
+        self._exchange: Callable[[int], int] | None = None
         self._command: Callable[[], int] | None = None
 
     def _make_senders(self) -> None:
@@ -179,6 +202,13 @@ class DriveClient:
                 self._command = self._port.commander(own | self._commanding)
         self._tick = tick
 
+    def compiled(self) -> Compiled | None:
+        """For the record that it is prepared for; None where exchange and command are not compiled."""
+        if self._exchange is None or self._command is None or self._port is None or self._sync is None:
+            return None
+        places = self._port.places
+        return Compiled(places[exchange], places[command], len(self._sync.view), self._log)
+
     @property
     def command(self) -> Message:
         """The command's message."""
@@ -192,19 +222,24 @@ class DriveClient:
 
     def exchange(self, tick: Any, deadline_ns: int) -> None:
         """:meth:`sync` and :meth:`receive`, in one compiled call where nothing is late. Raises as they do."""
-        exchange, code = self._exchange, PENDING
-        if exchange is not None and tick is self._tick and not (self._pending_flags or self._down):
-            count = self._sync_counter % 240 + 1
-            code = exchange(count, deadline_ns)
+        code = PENDING
+        if self._exchange is not None and tick is self._tick:
+            code = self._begun(EXCHANGED) or self._exchange(deadline_ns)
         if code == PENDING:
             self.sync(tick)
             self.receive(tick, deadline_ns)
-            return
-        self._sync_counter = count
-        if code:
-            if code <= UNSENT:
-                self._fail(code - UNSENT)
-            self._judge(code, deadline_ns)
+        elif code:
+            self._conclude(code, deadline_ns)
+
+    def _begun(self, what: int) -> int:
+        """What a compiled tick has begun and left to be concluded here, 0 for nothing."""
+        return 0 if self._port is None else self._port.begun(what)
+
+    def _conclude(self, code: int, deadline_ns: int) -> None:
+        """What :func:`drivers.posix.exchange` could not do itself. Raises LinkError when SYNC is not out."""
+        if code <= UNSENT:
+            self._fail(code - UNSENT)
+        self._judge(code, deadline_ns)
 
     def _take_late(self, tick: Any) -> None:
         self._late = True
@@ -217,7 +252,7 @@ class DriveClient:
     def _send_sync(self) -> None:
         if self._sync is None:
             return
-        self._sync_counter = count = self._sync_counter % 240 + 1
+        self._cells[_SYNCS] = count = self._cells[_SYNCS] % SYNC_COUNTS + 1
         if self._sync.raw[4]:
             self._sync.view[8] = count
         self._sync.encode(self._now())
@@ -230,22 +265,25 @@ class DriveClient:
         """
         if tick is not self._tick:
             self.prepare(tick)
+        if code := self._begun(EXCHANGED):
+            self._conclude(code, deadline_ns)
+            return
         drain = self._drain_socket
         code = 0 if drain is None else drain(deadline_ns, self._late)
-        if code or drain is None or self._pending_flags or self._down:
+        if code or drain is None or self._cells[_PENDING] or self._cells[_DOWN]:
             self._judge(code, deadline_ns)
 
     def _judge(self, code: int, deadline_ns: int) -> None:
         """Take what the kernel handed back, or all where there is none; the flags of it go into the tick."""
         drain = self._drain_socket
-        flags, self._pending_flags = self._pending_flags, 0
+        flags, self._cells[_PENDING] = self._cells[_PENDING], 0
         try:
             flags |= self._drain(deadline_ns) if drain is None else self._go_on(code, drain, deadline_ns)
         except LinkDown:
-            self._down = True
+            self._cells[_DOWN] = 1
         except LinkError:
             flags |= ERROR_FRAME
-        self._flags_cell[0] |= flags | (BUS_DOWN if self._down else 0)
+        self._flags_cell[0] |= flags | (BUS_DOWN if self._cells[_DOWN] else 0)
 
     def _drain(self, deadline_ns: int) -> int:
         """Flags of all that came."""
@@ -308,7 +346,7 @@ class DriveClient:
     def _on_error(self, error_class: int) -> int:
         """A controller that went off the bus, or came back to it, is down for good: nothing more is sent."""
         if error_class & (BUS_OFF | RESTARTED):
-            self._down = True
+            self._cells[_DOWN] = 1
         return ERROR_FRAME
 
     def _on_emergency(self, data: bytes) -> int:
@@ -323,8 +361,8 @@ class DriveClient:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:
             self.prepare(tick)
-        if self._command is not None and not self._down:
-            code = self._command()
+        if self._command is not None and not self._cells[_DOWN]:
+            code = self._begun(COMMANDED) or self._command()
             if code:
                 self._refuse(self._outgoing[0]) if code == REFUSED_COMMAND else self._fail(code)
         else:
@@ -363,7 +401,7 @@ class DriveClient:
 
     def _transmit(self, out: Outgoing) -> None:
         """Hand a frame that is laid out to the bus."""
-        if self._down:
+        if self._cells[_DOWN]:
             raise LinkDown(100, DOWN)
         try:
             self._raw_link.send_raw(out.view)
@@ -376,9 +414,9 @@ class DriveClient:
     def _note_failure(self, error: LinkError) -> None:
         """A bus that is down stays down; anything else is flagged in the next tick."""
         if isinstance(error, LinkDown):
-            self._down = True
+            self._cells[_DOWN] = 1
         else:
-            self._pending_flags |= SEND_FAILED
+            self._cells[_PENDING] |= SEND_FAILED
 
     def flush(self) -> None:
         """Hand the frames on that came and went since the last time."""
@@ -427,14 +465,12 @@ class DriveClient:
 
     def saved(self) -> Saved:
         """What its frames have left in it, but for the tick; :meth:`restore` goes back there."""
-        own = self._sync_counter, self._pending_flags, self._down
-        return Saved(self._state.tobytes(), self._last.tobytes(), own)
+        return Saved(self._state.tobytes(), self._last.tobytes())
 
     def restore(self, saved: Saved) -> None:
         """Be as one was when that was saved."""
         self._state.view("u1")[:] = np.frombuffer(saved.state, np.uint8)
         self._last.view("u1")[:] = np.frombuffer(saved.counters, np.uint8)
-        self._sync_counter, self._pending_flags, self._down = saved.own
 
     def discard(self) -> None:
         """Throw away what was received before the run."""

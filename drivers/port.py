@@ -7,10 +7,22 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from drivers.bus import SocketLink
 from drivers.jit import entry, places_of
-from drivers.posix import ARRAYS, DRAIN_MOST, FLAGS, FLAGS_AT, MORE, command, drain, exchange
+from drivers.posix import (
+    ARRAYS,
+    COMMANDED,
+    DRAIN_MOST,
+    FLAGS,
+    FLAGS_AT,
+    MORE,
+    command,
+    drain,
+    exchange,
+)
+from drivers.wire import STATE
 
 Arrays = dict[str, Any]
 """What :data:`drivers.posix.ARRAYS` names."""
@@ -20,18 +32,21 @@ class SocketPort:
     """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
 
     def __init__(self, link: SocketLink, shared: Arrays) -> None:
-        io = np.zeros(5, np.int64)
+        io = np.zeros(COMMANDED + 1, np.int64)
         self.io: Any = io.data
+        self.places: dict[Any, npt.NDArray[np.int64]] = {}
+        """What each kernel is called with."""
         self._shared: Arrays = {"fds": link.fds, "times": np.zeros(4, np.int64), "io": io, **shared}
         self._alive: dict[Any, Arrays] = {}
 
     def _over(self, kernel: Any, own: Arrays, *known: Any, free: tuple[Any, ...]) -> Callable[..., int]:
-        """The compiled form; the call that makes it, with ``free``, has descriptors that lead nowhere."""
+        """The compiled form; the call that makes it, with ``free``, leads nowhere and leaves no trace."""
         arrays = self._shared | own
         self._alive[kernel] = arrays
-        nowhere = np.full(4, -1, np.int32)
-        compiled = entry(kernel, places_of(arrays | {"fds": nowhere}, ARRAYS), *known, *free)
-        return partial(compiled, places_of(arrays, ARRAYS), *known)
+        nowhere = {"fds": np.full(4, -1, np.int32), "state": np.zeros(1, STATE)}
+        compiled = entry(kernel, places_of(arrays | nowhere, ARRAYS), *known, *free)
+        self.places[kernel] = places_of(arrays, ARRAYS)
+        return partial(compiled, self.places[kernel], *known)
 
     def drainer(self, own: Arrays, flags_at: int) -> Callable[[int, bool], int]:
         """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; the tick's flags' offset."""
@@ -44,9 +59,15 @@ class SocketPort:
         """Let the next drain begin anew."""
         self.io[FLAGS], self.io[MORE] = 0, DRAIN_MOST
 
-    def exchanger(self, own: Arrays, size: int) -> Callable[[int, int], int]:
-        """:func:`drivers.posix.exchange` for a SYNC that is laid out; called with count and deadline."""
-        made = self._over(exchange, own, size, free=(0, 0))
+    def begun(self, what: int) -> int:
+        """What an EXCHANGED or COMMANDED that a caller of the kernels has begun came to; 0 for none."""
+        code: int = self.io[what]
+        self.io[what] = 0
+        return code
+
+    def exchanger(self, own: Arrays, size: int) -> Callable[[int], int]:
+        """:func:`drivers.posix.exchange` for a SYNC that is laid out; called with the deadline."""
+        made = self._over(exchange, own, size, free=(0,))
         self.restart()
         return made
 

@@ -34,6 +34,8 @@ _errno_location = _types.ExternalFunction("__errno_location", _types.CPointer(_i
 MONOTONIC: Final = 1
 DONTWAIT: Final = 0x40
 POLLIN: Final = 1
+SYNC_COUNTS: Final = 240
+"""SYNC's counter goes from 1 to here (CiA 301)."""
 EINTR: Final = 4
 EAGAIN: Final = 11
 DONE, HANDED_BACK, PENDING = range(3)
@@ -43,7 +45,7 @@ REFUSED_COMMAND: Final = -1000
 UNSENT: Final = -2000
 """What -errno of a SYNC that was not sent is added to."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE, FLAGS_AT = range(5)
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED = range(7)
 DRAIN_MOST: Final = 256
 """Frames that are still read once the time has passed; a flood can't exceed it."""
 
@@ -149,19 +151,22 @@ def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
 
 
 @waiting
-def exchange(places: Any, size: int, count: int, deadline_ns: int) -> Any:
-    """Send SYNC with its count and :func:`drain`, unless frames wait to be taken as late ones: PENDING.
+def exchange(places: Any, size: int, deadline_ns: int) -> Any:
+    """Send SYNC with its counter and :func:`drain`, where nothing stands in the way: else PENDING.
 
-    Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
+    In the way are frames that wait to be taken as late ones, flags to be told, a bus that was down. Returns
+    what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
     state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
-    if wait(fds, times, 0) != 0:
+    s = state[0]
+    if s["pending"] != 0 or s["down"] != 0 or wait(fds, times, 0) != 0:
         return PENDING
-    state[0]["got"] = 0
+    s["got"] = 0
+    s["syncs"] = s["syncs"] % SYNC_COUNTS + 1
     if raw[4] > 0:
-        raw[DATA_AT] = count
-    note(log, state[0], raw, 0, now_ns(times))
+        raw[DATA_AT] = s["syncs"]
+    note(log, s, raw, 0, now_ns(times))
     code = transmit(fds, raw, size, state, log)
     return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
 

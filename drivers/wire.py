@@ -60,10 +60,11 @@ values; ``seen``: what a good frame is flagged with besides."""
 STATE: Final = np.dtype(
     [
         ("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("logged", "i8"),
-        ("last_sent", "i8"), ("controlword", "i8"),
+        ("last_sent", "i8"), ("controlword", "i8"), ("syncs", "i8"), ("pending", "i8"), ("down", "i8"),
     ]
 )  # fmt: skip
-"""``last_sent``, ``controlword``: of the last command.
+"""``last_sent``, ``controlword``: of the last command; ``syncs``: SYNC's counter. ``pending``: flags for the
+next tick; ``down``: the bus was down, nothing more is sent; the client sets both and looks at them.
 ``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has."""
 FRAME: Final = np.dtype(
     [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
 from drivers.mapping import MEASURED, RECEIVED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
-from hil import realtime
+from hil import fused, realtime
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, WireFacts, build
@@ -35,7 +36,7 @@ from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Words, guardian
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.log.split import part_path
-from hil.loop import Loop, Outcome, Plan, StopRequest
+from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
 from hil.ports import Drive
 from hil.progress import say, watching
 from hil.shadow import ShadowDrive
@@ -368,6 +369,7 @@ def compile_kernels(setup: Setup) -> None:
     setup.machine.looped()
     fac = setup.config.controller.kind == "fac"
     precompile(setup.database, setup.binding.map, fac, new_ticks()[0])
+    fused.load()
 
 
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
@@ -414,13 +416,18 @@ def _recorded(
             _await_drive(setup, client)
             recorder.await_open()
             say(f"{'listening only' if watch else 'arming'}; log {path}")
-            client.discard()
             drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
             if words:
                 drive = GuardedDrive(client, words, clock.now_ns)
             if watch:
                 recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
-            result = _run_armed(setup, drive, recorder, clock, request)
+            machine, plan = setup.machine.fresh(), plan_of(config)
+            alone = watch is not None or clock.name != "monotonic"
+            whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
+            parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
+            loop = Loop(*parts)
+            client.discard()
+            result = _run_armed(setup, loop, plan, recorder, clock, request)
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
         raise
@@ -452,13 +459,12 @@ def plan_of(config: RunConfig) -> Plan:
 
 def _run_armed(
     setup: Setup,
-    drive: Drive,
+    loop: Loop,
+    plan: Plan,
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
 ) -> RunResult:
-    machine, plan = setup.machine.fresh(), plan_of(setup.config)
-    loop = Loop(drive, clock, recorder, machine.looped(), recorder.record, plan, request)
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:

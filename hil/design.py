@@ -61,14 +61,15 @@ class Machine:
         if not COMPILED:
             return partial(whole, *self._records())
         other = self.fresh()
-        call = partial(entry(whole_at, other._places(), new_ticks()), self._places())
+        call = partial(entry(whole_at, other.places(), new_ticks()), self.places())
         call.__dict__["alive"] = self  # the places are of its records
         return call
 
     def _records(self) -> tuple[Record, ...]:
         return self.reference, self.safety, self.safety_state, self.law, self.law_state
 
-    def _places(self) -> npt.NDArray[np.int64]:
+    def places(self) -> npt.NDArray[np.int64]:
+        """Where its records are, for :func:`hil.kernel.whole_at`; it must outlive their use."""
         rows = zip(self._records(), PLACED, strict=True)
         return np.array([place_of(record, dtype) for record, dtype in rows], np.int64)
 

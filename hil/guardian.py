@@ -23,6 +23,8 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import Any, Protocol
 
+from numba.extending import register_jitable
+
 from hil.clock import RealClock
 from hil.errors import HilError
 from hil.ports import Drive
@@ -49,6 +51,14 @@ class Word(IntEnum):
 ARMED, BEAT_NS, COUNTER, FIRED, GUARD_NS = map(int, Word)
 DISARMED = int(DriveState.SWITCH_ON_DISABLED)
 GUARDIAN, GUARDIAN_LOST = int(RxFlag.GUARDIAN), int(RxFlag.GUARDIAN_LOST)
+
+
+@register_jitable
+def guardian_flags(words: Any) -> int:
+    """RxFlag bits of what the guardian did; it is lost when its own heartbeat is old."""
+    if words[FIRED] != 0:
+        return GUARDIAN
+    return GUARDIAN_LOST if words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS else 0
 
 
 class Stopper(Protocol):
@@ -94,11 +104,7 @@ class GuardedDrive:
         self._note_guardian()
 
     def _note_guardian(self) -> None:
-        words = self._words
-        if words[FIRED]:
-            self._flags[0] |= GUARDIAN
-        elif words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS:
-            self._flags[0] |= GUARDIAN_LOST
+        self._flags[0] |= guardian_flags(self._words)
 
     def send(self, tick: Any) -> None:
         """The command. Raises OSError once the guardian has stopped the drive; the record stays as it is."""

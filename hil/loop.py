@@ -17,6 +17,12 @@ from hil.trouble import TROUBLE, Trouble
 
 Pacing = Literal["sync", "feedback", "timer"]
 Step = Callable[[TickArray], None]
+Whole = Callable[[int, int, int, bool], int]
+"""A whole tick in one compiled call, as far as it goes: its number, deadline [ns], the request, whether the
+log failed; see :mod:`hil.fused`. It returns the stage that it reached."""
+NOT_BEGUN, BEGUN, DECIDED, SENT, RECORDED = range(5)
+"""Stages of a tick: SYNC is not out; SYNC is out, the drive has feedback to conclude; the law has run; the
+command is out, where there is one; the record is stored. What is left is done here."""
 MAX_NS = 2**31 - 1
 NO_WAIT = 1
 """A deadline that has long passed: one feedback if it is there already."""
@@ -71,6 +77,16 @@ class Outcome:
     state: int = 0
 
 
+def none_compiled(_k: int, _deadline_ns: int, _asked: int, _log_failed: bool) -> int:
+    """Every tick is left to the loop."""
+    return NOT_BEGUN
+
+
+def no_whole() -> Whole:
+    """No tick is compiled."""
+    return none_compiled
+
+
 def transition_event(state: int, reason: int) -> tuple[str, str]:
     """Kind and text of the event that a change of the supervisor's state is logged as."""
     name = DriveState(state).name
@@ -103,7 +119,13 @@ class Cells:
 
 
 class Loop:
-    """A closed loop over a drive port. :meth:`run` returns after a safe stop, whatever happened."""
+    """A closed loop over a drive port. :meth:`run` returns after a safe stop, whatever happened.
+
+    It is prepared when it is made: that sends nothing and takes longer than many ticks.
+
+    ``whole`` makes, for the prepared drive, the tick in which nothing is unusual; what that leaves is done by
+    the rules here, which are its own.
+    """
 
     def __init__(
         self,
@@ -114,6 +136,7 @@ class Loop:
         ticks: TickArray,
         plan: Plan,
         request: StopRequest,
+        whole: Callable[[], Whole] = no_whole,
     ) -> None:
         self._drive, self._clock, self._recorder = drive, clock, recorder
         self._step, self._ticks, self._plan, self._request = step, ticks, plan, request
@@ -123,6 +146,10 @@ class Loop:
         self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
         self._arrived_ns = 0
         self._state = int(DriveState.SWITCH_ON_DISABLED)
+        self._tick: Any = ticks[0]
+        drive.prepare(self._tick)
+        self._whole = whole()
+        self._ended = False  # True once the supervisor has left every state in which it drives
 
     def run(self) -> Outcome:
         """Run until the supervisor has ended the run. The drive is stopped on every way out."""
@@ -133,23 +160,46 @@ class Loop:
         return self._outcome
 
     def _run(self) -> None:
-        tick: Any = self._ticks[0]
-        clock, plan, outcome, t = self._clock, self._plan, self._outcome, self._cells
-        self._drive.prepare(tick)
-        start_ns = clock.now_ns()
+        outcome, period_ns, recorder = self._outcome, self._plan.period_ns, self._recorder
+        tick, whole = self._tick, self._whole
+        start_ns = self._clock.now_ns()
         k = 0
         while True:
-            deadline_ns = start_ns + k * plan.period_ns
-            now_ns = clock.sleep_until(deadline_ns) if plan.pacing != "feedback" else clock.now_ns()
-            gap = 1
-            if now_ns - deadline_ns >= plan.period_ns:
-                k, gap = self._skip(k, deadline_ns, now_ns)
-                deadline_ns = start_ns + k * plan.period_ns
-            k = self._one(tick, k, deadline_ns, gap, now_ns)
+            deadline_ns = start_ns + k * period_ns
+            stage = whole(k, deadline_ns, self._asked(k), recorder.failed)
+            if stage != RECORDED:
+                k = self._rest(stage, tick, k, deadline_ns)
             outcome.ticks += 1
-            if t.reason[0] and self._ended():
+            if self._ended:
                 return
             k += 1
+
+    def _asked(self, k: int) -> int:
+        """What is asked of the supervisor; at the end of the run a stop, at least."""
+        asked = self._request.value
+        return asked if k < self._end else max(STOP, asked)
+
+    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> int:
+        """What is left of a tick that got to ``stage``; return k, which may have moved on."""
+        if stage == NOT_BEGUN:
+            k = self._on_time(tick, k, deadline_ns)
+        elif stage == BEGUN:
+            k = self._one(tick, k, deadline_ns, 1, deadline_ns + self._cells.lateness_ns[0])
+        else:
+            if stage == DECIDED:
+                self._answer(tick, deadline_ns)
+            self._note(k, deadline_ns)
+        return k
+
+    def _on_time(self, tick: Any, k: int, deadline_ns: int) -> int:
+        """Wait for the tick's time and run it, or the one whose time it is then; return its k."""
+        clock, plan = self._clock, self._plan
+        now_ns = clock.sleep_until(deadline_ns) if plan.pacing != "feedback" else clock.now_ns()
+        gap = 1
+        if now_ns - deadline_ns >= plan.period_ns:
+            k, gap = self._skip(k, deadline_ns, now_ns)
+            deadline_ns += (gap - 1) * plan.period_ns
+        return self._one(tick, k, deadline_ns, gap, now_ns)
 
     def _skip(self, k: int, deadline_ns: int, now_ns: int) -> tuple[int, int]:
         """Return the tick to run now and the periods since the last one; whole periods late are skipped."""
@@ -170,26 +220,35 @@ class Loop:
             self._drive.receive(tick, 0)
         else:
             k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
-        ns = now() - deadline_ns  # four times a tick: the call of bounded() would cost more than the rest
-        t.received_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
+        t.received_ns[0] = bounded(now() - deadline_ns)
         if self._plan.pacing == "timer":
             self._note_age(deadline_ns)
         self._step(self._ticks)
-        ns = now() - deadline_ns
-        t.computed_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
+        t.computed_ns[0] = bounded(now() - deadline_ns)
+        self._answer(tick, deadline_ns)
+        self._note(k, deadline_ns)
+        return k
+
+    def _answer(self, tick: Any, deadline_ns: int) -> None:
+        """Send the command where there is one."""
+        t = self._cells
         if t.send[0]:
             self._send(tick)
-        ns = now() - deadline_ns
-        t.sent_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
+        t.sent_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
+
+    def _note(self, k: int, deadline_ns: int) -> None:
+        """Log what is new, then the record; find out whether the run has ended."""
+        t = self._cells
         if t.rx_flags[0] & TROUBLE:
             self._trouble.note(deadline_ns, k, t.rx_flags[0])
         if t.state[0] != self._state:
             self._state = t.state[0]
             self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))
         self._recorder.tick(self._ticks)
-        ns = now() - deadline_ns
-        t.recorded_ns[0] = ns if -MAX_NS <= ns <= MAX_NS else bounded(ns)
-        return k
+        t.recorded_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
+        if t.reason[0]:
+            self._outcome.state, self._outcome.reason = t.state[0], t.reason[0]
+            self._ended = t.state[0] in ENDED
 
     def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
         """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
@@ -235,8 +294,7 @@ class Loop:
         t.gap[0] = gap
         t.skipped[0] = gap - 1
         t.lateness_ns[0] = bounded(now_ns - deadline_ns)
-        asked = self._request.value
-        t.request[0] = asked if k < self._end else max(STOP, asked)
+        t.request[0] = self._asked(k)
         t.log_failed[0] = self._recorder.failed
 
     def _exchange(self, tick: Any, deadline_ns: int) -> None:
@@ -253,9 +311,3 @@ class Loop:
         except OSError as error:
             t = self._cells
             self._recorder.event(t.t_ns[0], t.k[0], "send-failed", str(error))
-
-    def _ended(self) -> bool:
-        """True once the supervisor has left every state in which it drives; asked with a reason to stop."""
-        outcome, t = self._outcome, self._cells
-        outcome.state, outcome.reason = t.state[0], t.reason[0]
-        return outcome.state in ENDED

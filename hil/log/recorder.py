@@ -13,9 +13,12 @@ import time
 from pathlib import Path
 from typing import IO, Any, Final
 
+import numpy as np
+import numpy.typing as npt
+
 from hil.log.errors import LogError
 from hil.log.mcapfile import CHUNK_BYTES
-from hil.log.push import pusher
+from hil.log.push import pusher, ring_places
 from hil.log.records import EVENT_BYTES, FRAME_RECORD, pack_event_record
 from hil.log.ring import BEAT_AT, FAILED_AT, Ring
 from hil.log.split import part_path
@@ -74,7 +77,7 @@ def first_line(stream: IO[bytes], timeout_s: float) -> str:
     return stream.readline().decode(errors="replace").strip()
 
 
-def refuse() -> bool:
+def refuse() -> int:
     """The push of a recorder that is closed."""
     raise LogError("the recorder is closed")
 
@@ -164,6 +167,12 @@ class Recorder:
     def record(self) -> TickArray:
         """The record that it is ready to store: a loop that writes it has a first tick like the others."""
         return self._record
+
+    def places(self, frames: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """What :func:`hil.log.push.push` stores :attr:`record` by, and rows of :attr:`frames`."""
+        both = (self._ticks, self._record), (self._frames, frames)
+        ticks, more = (ring_places(ring, records.view(np.uint8)) for ring, records in both)
+        return ticks, more
 
     def _attach(self, record: TickArray) -> None:
         """Be ready to store this very record."""

@@ -12,11 +12,11 @@ import pytest
 
 from drivers.bus import BusSettings, Link, open_link
 from drivers.client import DriveClient
+from hil import fused
 from hil.app import Overrides, header_of, load_setup
-from hil.clock import LockstepClock
+from hil.clock import LockstepClock, RealClock
 from hil.log.recorder import Recorder
-from hil.loop import Loop, Plan, StopRequest
-from hil.signals import TickArray, new_ticks
+from hil.loop import NOT_BEGUN, Loop, Plan, StopRequest, Whole, none_compiled
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.process, pytest.mark.compiled]
@@ -36,9 +36,10 @@ def answering(peer: Link, answers: list[bytes]) -> int:
     return pid
 
 
-def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
+@pytest.mark.parametrize("compiled", [False, True], ids=["the loop's rules", "the compiled tick"])
+def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str, compiled: bool) -> None:
     setup = load_setup(CONFIGS / "demo.toml", Overrides())
-    machine, ticks = setup.machine.fresh(), new_ticks()
+    machine, clock = setup.machine.fresh(), RealClock() if compiled else LockstepClock()
     setup.machine.warm_up()
     recorder = Recorder(tmp_path / "run.mcap", header_of(setup, "run", "lockstep"), 2000)
     recorder.await_open()
@@ -48,19 +49,25 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
     feedback = setup.database.message("FEEDBACK")
     answers = [feedback.encode({"Counter": k, "State": 1}) for k in range(16)]
     seen: list[tuple[int, int]] = []
-    looped = machine.looped()
-    count = 0
+    plan, step = Plan(1_000_000, 800_000, "sync", TICKS), machine.looped()
+    count = left = 0
 
-    def step(array: TickArray) -> None:
-        nonlocal count
-        looped(array)
-        count += 1
-        if count in (SETTLED, TICKS - 10):
-            seen.append((gc.get_count()[0], sys.getallocatedblocks()))
+    def looked() -> Whole:
+        made = fused.whole_tick(client, None, machine, recorder, plan) if compiled else none_compiled
 
-    plan = Plan(1_000_000, 800_000, "sync", TICKS)
+        def whole(k: int, deadline_ns: int, asked: int, log_failed: bool) -> int:
+            nonlocal count, left
+            count += 1
+            if count in (SETTLED, TICKS - 10):
+                seen.append((gc.get_count()[0], sys.getallocatedblocks()))
+            stage = made(k, deadline_ns, asked, log_failed)
+            left += stage == NOT_BEGUN
+            return stage
+
+        return whole
+
     drive = answering(peer, answers)
-    loop = Loop(client, LockstepClock(), recorder, step, ticks, plan, StopRequest())
+    loop = Loop(client, clock, recorder, step, recorder.record, plan, StopRequest(), looked)
     gc.collect()
     gc.disable()
     try:
@@ -73,6 +80,7 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str) -> None:
         client.close()
         peer.close()
     assert len(seen) == 2, "the loop ended early"
+    assert left < 0.2 * count if compiled else left == count
     (objects, blocks), (objects_then, blocks_then) = seen
     assert objects_then - objects <= 20, "a tick leaves objects for the collector"
     assert blocks_then - blocks <= 200, "memory grows with the ticks"

@@ -11,7 +11,7 @@ from tests.conftest import ROOT
 
 PACKAGES = ("hil", "drivers", "firmware_model")
 STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclasses", "math", "typing", "enum"}
-ROOT_MODULES = ("app", "cli", "emulate", "simulate", "demo", "check", "faults/case", "convert/rerun")
+ROOT_MODULES = ("app", "fused", "cli", "emulate", "simulate", "demo", "check", "faults/case", "convert/rerun")
 COMPOSITION = {f"hil/{name}.py" for name in ROOT_MODULES}
 
 

@@ -17,10 +17,11 @@ from hil.bench.cyclictest import MISSING, cyclictest, parse
 from hil.bench.histogram import TOP_US, Histogram
 from hil.bench.machine import machine_facts, resident_kib
 from hil.bench.measure import TRIES, highest, phases, rates_that_hold
-from hil.bench.meter import LOOP, Meter
+from hil.bench.meter import by_phase, reading_ns
 from hil.bench.processes import awake, seconds_in_time, share_in_time
 from hil.bench.view import ratios, read_result
 from hil.errors import HilError
+from hil.fused import LAST, LOOP, PHASES, SEND, mark, new_marks
 from hil.signals import new_ticks
 
 CYCLICTEST = """\
@@ -170,36 +171,29 @@ def test_memory_of_a_process_that_has_gone_is_zero() -> None:
     assert resident_kib(2**22 + 1) == 0
 
 
-def test_a_phase_is_counted_without_the_phases_that_it_calls() -> None:
-    def spin() -> None:
-        end = time.thread_time_ns() + 2_000_000
-        while time.thread_time_ns() < end:
-            pass
-
-    meter = Meter([LOOP, "outer", "inner"])
-    inner = meter.wrap(2, spin)
-
-    def both() -> None:
-        spin()
-        inner()
-
-    meter.start()
-    meter.wrap(1, both)()
-    spin()
-    meter.stop()
-    assert meter.calls == [0, 1, 1] and meter.made == [1, 1, 0]
-    assert all(1_900_000 < ns < 20_000_000 for ns in meter.ns), meter.ns
-    assert meter.sums(100.0, 10.0)["outer"] == meter.ns[1] - 110.0
+@pytest.mark.compiled
+def test_a_border_gives_its_phase_what_the_thread_took_since_the_last() -> None:
+    marks, times = new_marks(), np.zeros(4, np.int64)
+    mark(marks, LOOP, times)
+    marks[LOOP] = 0
+    end = time.thread_time_ns() + 2_000_000
+    while time.thread_time_ns() < end:
+        pass
+    mark(marks, SEND, times)
+    assert 1_900_000 < marks[SEND] < 20_000_000
+    assert marks[LAST] <= time.thread_time_ns()
+    assert marks.sum() == marks[SEND] + marks[LAST]
+    mark(np.zeros(0, np.int64), SEND, times)  # without a meter
+    assert 0 < reading_ns() < 1e6
 
 
-def test_a_meter_goes_on_after_an_error_in_a_phase() -> None:
-    meter = Meter([LOOP, "fails"])
+def test_phases_are_a_ticks_share_without_the_readings() -> None:
+    marks = new_marks()
+    marks[:LAST] = np.arange(1, LAST + 1) * 1000
+    found = by_phase(marks, 10, 30.0)
+    assert list(found) == list(PHASES) and found["loop"] == 70.0 and found["record"] == 100.0 * LAST - 30.0
 
-    def fails() -> None:
-        raise OSError("the bus is down")
 
-    meter.start()
-    with pytest.raises(OSError, match="the bus is down"):
-        meter.wrap(1, fails)()
-    meter.stop()
-    assert meter.ns[0] > 0 and meter.calls[1] == 1
+def test_a_run_without_a_compiled_tick_has_no_phases() -> None:
+    with pytest.raises(HilError, match="no phases"):
+        by_phase(new_marks(), 10, 0.0)

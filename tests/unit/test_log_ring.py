@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.log.push import pusher
+from hil.log.push import push, pusher, ring_places
 from hil.log.ring import HEADER_BYTES, Ring, RingError, attach
 
 SIZE = 16
@@ -177,6 +177,27 @@ def test_two_processes_lose_and_tear_nothing() -> None:
         time.sleep(0.0005)
     assert producer.wait(30) == 0 and ring.take(final=True) == b""
     ring.close()
+
+
+@pytest.mark.compiled
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 6), st.booleans()), max_size=40))
+def test_many_by_the_kernel_are_many_by_the_ring(steps: list[tuple[int, bool]]) -> None:
+    """Pushes of several and takes, wrapped or full: the same records, the same drops."""
+    rows = np.zeros((6, SIZE // 8), np.int64)
+    plain, compiled = Ring.create("plain", SIZE, 5), Ring.create("compiled", SIZE, 5)
+    places, number = ring_places(compiled, rows.view(np.uint8).reshape(-1)), 0
+    for count, take in steps:
+        rows[:count] = np.arange(number, number + count)[:, None]
+        number += count
+        plain.push_many(memoryview(rows[:count].tobytes()))
+        push(places, count)
+        assert compiled.dropped == plain.dropped and compiled.published == plain.published
+        if take:
+            assert numbers(compiled.take()) == numbers(plain.take())
+    assert compiled.take(final=True) == plain.take(final=True)
+    plain.close()
+    compiled.close()
 
 
 def test_another_process_can_attach_by_pid() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hil.bench.meter import LOOP, PHASES
+from hil.fused import PHASES
 from tests.vm.guest.instructions import BUSES
 from tests.vm.instructions import apart, budget, excess, read, table_of, total_of
 
@@ -44,11 +44,8 @@ def test_two_runs_of_a_boot_cost_the_same(counted: dict[str, Any], name: str) ->
 
 @pytest.mark.parametrize("name", BUSES)
 def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str) -> None:
-    """A phase that is nowhere has been renamed in the code: the meter's table has to follow.
-
-    The meter takes some thousand instructions a tick, taken off but for caches and rounding.
-    """
+    """The meter takes some thousand instructions a tick, taken off but for caches and rounding."""
     bus = of_bus(counted, name)
-    assert set(bus["phases"]) == {LOOP, *PHASES}
+    assert set(bus["phases"]) == set(PHASES)
     assert min(bus["phases"].values()) > 0, bus["phases"]
     assert sum(bus["phases"].values()) == pytest.approx(total_of(bus), rel=0.2), bus

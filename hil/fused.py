@@ -1,0 +1,250 @@
+"""A whole tick as one compiled call: what :mod:`hil.loop` does with its ports, where nothing is unusual.
+
+Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
+long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
+ports. It has no rules of its own: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
+guard :func:`hil.kernel.whole_at`; the command :func:`drivers.posix.command`; the records
+:func:`hil.log.push.push`; the guardian's words as :class:`hil.guardian.GuardedDrive` keeps them. At the first
+thing that is unusual it returns the stage that it reached, and the loop does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from drivers.client import FLUSH_AT, DriveClient
+from drivers.jit import COMPILED, array_at, entry, jit, place_of, waiting
+from drivers.posix import (
+    ARRAYS,
+    COMMANDED,
+    DONE,
+    EINTR,
+    EXCHANGED,
+    IO,
+    PENDING,
+    STATES,
+    TIMES,
+    command,
+    exchange,
+    now_ns,
+)
+from drivers.wire import STATE
+from hil.design import Machine
+from hil.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
+from hil.kernel import PLACED, whole_at
+from hil.log.push import push
+from hil.log.recorder import Recorder
+from hil.loop import BEGUN, DECIDED, MAX_NS, NOT_BEGUN, RECORDED, SENT, Plan, Whole, none_compiled
+from hil.signals import TICK
+from hil.trouble import TROUBLE
+
+PHASES: Final = (
+    "loop", "sleep", "sync, receive, check, decode", "control and guard", "encode, send", "record",
+)  # fmt: skip
+"""Where a tick's processor time goes; ``loop`` is what lies between two calls."""
+LOOP, SLEEP, READ, CONTROL, SEND, RECORD = range(6)
+LAST: Final = len(PHASES)
+"""Behind the phases' sums: the thread's processor time at the last border."""
+Marks = npt.NDArray[np.int64]
+"""Each phase's processor time [ns], added up, and :data:`LAST`."""
+
+_types: Any = numba.types
+_clock_gettime = _types.ExternalFunction("clock_gettime", _types.int32(_types.int32, _types.uintp))
+_clock_nanosleep = _types.ExternalFunction(
+    "clock_nanosleep", _types.int32(_types.int32, _types.int32, _types.uintp, _types.uintp)
+)
+MONOTONIC, THREAD_CPUTIME, ABSOLUTE = 1, 3, 1
+I8: Final = np.dtype(np.int64)
+
+# rows of the table of places
+EXCHANGE: Final = 0
+COMMAND: Final = EXCHANGE + len(ARRAYS)
+LAW: Final = COMMAND + len(ARRAYS)
+TICKS_IN: Final = LAW + len(PLACED)
+FRAMES_IN: Final = TICKS_IN + 3
+WORDS: Final = FRAMES_IN + 3
+PLAN, TICK_AT, MARKS, ROWS = range(WORDS + 1, WORDS + 5)
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES = range(3)
+
+
+def whole_tick(
+    client: DriveClient,
+    words: Words | None,
+    machine: Machine,
+    recorder: Recorder,
+    plan: Plan,
+    marks: Marks | None = None,
+) -> Whole:
+    """The tick of a run on a socket that is paced by SYNC in real time; another is the loop's alone.
+
+    The client must be prepared for the recorder's record, and for no other later.
+    """
+    ports = client.compiled()
+    if not COMPILED or ports is None or plan.pacing != "sync":
+        return none_compiled
+    timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes])
+    shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
+    marks = np.zeros(0, np.int64) if marks is None else marks
+    rows = [(shared, I8), (timing, I8), (recorder.record, TICK), (marks, I8)]
+    own = np.array([place_of(*row) for row in rows])
+    records, frames = recorder.places(ports.log)
+    table = np.concatenate([ports.exchange, ports.command, machine.places(), records, frames, own])
+    call = partial(_compiled(), table)
+    call.__dict__["alive"] = (ports, machine, recorder, rows)  # the places are of their arrays
+    return call
+
+
+def _compiled() -> Callable[..., int]:
+    """The compiled form; the call that makes it is for a tick that is late, which it leaves alone."""
+    table = np.zeros((ROWS, 2), np.int64)
+    known = [(PLAN, np.zeros(3, np.int64)), (MARKS, np.zeros(0, np.int64)), (TIMES, np.zeros(4, np.int64))]
+    for row, array in known:
+        table[row] = place_of(array, I8)
+    return entry(run_tick, table, 0, 0, 0, False)
+
+
+def new_marks() -> Marks:
+    """All zero."""
+    return np.zeros(LAST + 1, np.int64)
+
+
+def load() -> None:
+    """Compile it, or load it."""
+    if COMPILED:
+        _compiled()
+
+
+@jit
+def mark(marks: Any, phase: int, times: Any) -> None:
+    """Add what the thread took since the last border to a phase."""
+    if len(marks) > 0:
+        _clock_gettime(THREAD_CPUTIME, times.ctypes.data)
+        ns = times[0] * 1_000_000_000 + times[1]
+        marks[phase] += ns - marks[LAST]
+        marks[LAST] = ns
+
+
+@jit
+def mark_often(marks: Any, count: int) -> None:
+    """So many borders of nothing, for what one takes."""
+    times = np.zeros(4, np.int64)
+    for _ in range(count):
+        mark(marks, LOOP, times)
+
+
+@jit
+def sleep_until(deadline_ns: int, times: Any) -> Any:
+    """Sleep to the absolute deadline, or to a signal; return the time of waking."""
+    woken_ns = now_ns(times)
+    while woken_ns < deadline_ns:
+        times[2], times[3] = deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000
+        failed = _clock_nanosleep(MONOTONIC, ABSOLUTE, times[2:].ctypes.data, 0)
+        woken_ns = now_ns(times)
+        if failed == EINTR:
+            break
+    return woken_ns
+
+
+@jit
+def since(deadline_ns: int, times: Any) -> Any:
+    """Time after the deadline, as the record holds it."""
+    return min(now_ns(times) - deadline_ns, MAX_NS)
+
+
+@jit
+def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_failed: bool) -> None:
+    """The fields of a tick that is neither late nor the first after others that were skipped."""
+    t["k"], t["t_ns"], t["lateness_ns"] = k, deadline_ns, woken_ns - deadline_ns
+    t["gap"], t["skipped"], t["rx_flags"] = 1, 0, 0
+    t["request"], t["log_failed"] = asked, log_failed
+
+
+@jit
+def read(table: Any, t: Any, deadline_ns: int) -> Any:
+    """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
+    words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
+    places = table[EXCHANGE:COMMAND]
+    times, io = array_at(places, TIMES, I8), array_at(places, IO, I8)
+    if len(words) > 0:
+        words[BEAT_NS] = now_ns(times)
+        if words[FIRED] != 0:
+            return NOT_BEGUN
+    code = exchange(places, plan[SYNC_BYTES], deadline_ns + plan[TIMEOUT_NS])
+    if code == PENDING:
+        return NOT_BEGUN
+    if code != DONE:
+        io[EXCHANGED] = code
+        return BEGUN
+    if len(words) > 0:
+        t["rx_flags"] |= guardian_flags(words)
+    return DECIDED
+
+
+@jit
+def answer(table: Any, t: Any) -> Any:
+    """The command, if there is one. Returns the stage reached: SENT when the loop has nothing to send."""
+    words, places = array_at(table, WORDS, I8), table[COMMAND:LAW]
+    times, io = array_at(places, TIMES, I8), array_at(places, IO, I8)
+    if t["send"] == 0:
+        return SENT
+    if len(words) > 0:
+        words[BEAT_NS] = now_ns(times)
+        words[ARMED], words[COUNTER] = int(t["state"] != DISARMED), t["counter"]
+        if words[FIRED] != 0:
+            return DECIDED
+    code = command(places)
+    if code != DONE:
+        io[COMMANDED] = code
+        return DECIDED
+    return SENT
+
+
+@jit
+def hand_on(table: Any) -> None:
+    """Frames into their ring, some ticks' together."""
+    state = array_at(table[EXCHANGE:COMMAND], STATES, STATE)
+    if state[0]["logged"] >= FLUSH_AT:
+        push(table[FRAMES_IN:WORDS], state[0]["logged"])
+        state[0]["logged"] = 0
+
+
+@waiting
+def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
+    """A tick at its deadline [ns]; returns the stage of :mod:`hil.loop` that it reached."""
+    times, marks = array_at(table, TIMES, I8), array_at(table, MARKS, I8)
+    mark(marks, LOOP, times)
+    woken_ns = sleep_until(deadline_ns, times)
+    mark(marks, SLEEP, times)
+    late_ns = woken_ns - deadline_ns
+    if late_ns < 0 or late_ns >= array_at(table, PLAN, I8)[PERIOD_NS]:
+        return NOT_BEGUN
+    ticks = array_at(table, TICK_AT, TICK)
+    t = ticks[0]
+    stamp(t, k, deadline_ns, woken_ns, asked, log_failed)
+    stage = read(table, t, deadline_ns)
+    mark(marks, READ, times)
+    if stage < DECIDED:
+        return stage
+    t["received_ns"] = since(deadline_ns, times)
+    state = t["state"]
+    whole_at(table[LAW:TICKS_IN], ticks)
+    t["computed_ns"] = since(deadline_ns, times)
+    mark(marks, CONTROL, times)
+    stage = answer(table, t)
+    if stage < SENT:
+        return stage
+    t["sent_ns"] = since(deadline_ns, times)
+    mark(marks, SEND, times)
+    hand_on(table)
+    if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state:
+        return SENT
+    push(table[TICKS_IN:FRAMES_IN], 1)
+    t["recorded_ns"] = since(deadline_ns, times)
+    mark(marks, RECORD, times)
+    return RECORDED

@@ -1,0 +1,425 @@
+"""The compiled tick against the loop's own rules: the same drive, the same disturbances, the same log.
+
+Each case runs twice, with and without the compiled tick. Everything but the stamps must be equal: every field
+of every record, the frames that passed, the events, how it ended. And each case says which stages of the tick
+were left to the loop, so that a compiled tick that left everything to it would fail.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import socket
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from drivers.bus import BusSettings, SocketLink, open_link
+from drivers.client import DriveClient
+from drivers.local import CLASSIC, pack_frame
+from hil import fused
+from hil.app import Overrides, Setup, header_of, load_setup
+from hil.clock import RealClock
+from hil.guardian import ARMED, BEAT_NS, COUNTER, FIRED, GUARD_NS, GUARDIAN_LOST_NS, GuardedDrive, Words
+from hil.log.reader import Log, open_log
+from hil.log.recorder import Recorder, open_recorder
+from hil.loop import (
+    BEGUN,
+    DECIDED,
+    NOT_BEGUN,
+    RECORDED,
+    SENT,
+    Loop,
+    Plan,
+    StopRequest,
+    Whole,
+    no_whole,
+    none_compiled,
+)
+from hil.signals import FIELDS, Reason, TickArray
+from tests.conftest import CONFIGS
+
+pytestmark = [pytest.mark.compiled, pytest.mark.process]
+
+PERIOD_NS, TIMEOUT_NS = 10_000_000, 8_000_000  # a busy host answers within that
+TICKS = 90
+TURNS = 5
+"""A host that stalls for a period makes two runs differ; so often it may try again."""
+STATES = {0x0: 1, 0x6: 2, 0x7: 3, 0xF: 4}
+STAMPS = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns"}
+SYNC, FEEDBACK, COMMAND, EMERGENCY, STATUS = 0x080, 0x181, 0x201, 0x081, 0x281
+
+
+class Drive(threading.Thread):
+    """Answers SYNC over the other end of the loop's socket; ``act`` says how."""
+
+    def __init__(self, setup: Setup, end: socket.socket, words: Words, act: Act) -> None:
+        super().__init__()
+        self.end, self.words, self._act = end, words, act
+        self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
+        self._over = threading.Event()
+        self.counter = self._echo = self._state = 0
+        self.heard: list[int] = []
+
+    def run(self) -> None:
+        n = 0
+        self.end.settimeout(0.05)
+        while not self._over.is_set():
+            try:
+                raw = self.end.recv(128)
+            except TimeoutError:
+                continue
+            except OSError:
+                return
+            can_id, _, data = CLASSIC.unpack(raw)
+            self.heard.append(can_id)
+            if can_id == COMMAND:
+                self._echo, self._state = data[1] & 15, STATES.get(data[2] | data[3] << 8, self._state)
+            elif can_id == SYNC:
+                self.words.cells[GUARD_NS] = time.monotonic_ns()
+                with contextlib.suppress(OSError):  # the loop may have ended
+                    self._act(self, n)
+                n += 1
+
+    def feedback(self, n: int) -> bytes:
+        """Feedback on the n-th SYNC, with the next counter: never twice the same speed."""
+        self.counter = (self.counter + 1) % 16
+        values = {"Speed": 0.01 * (n % 7), "CurrentQ": 0.001 * (n % 11), "CurrentD": 0.01 * (n % 3)}
+        more = {"Counter": self.counter, "Echo": self._echo, "State": self._state}
+        return pack_frame(FEEDBACK, self._feedback.encode({**values, **more}))
+
+    def status(self, n: int) -> bytes:
+        """STATUS with healthy values."""
+        values = {"Counter": n % 16, "DcLinkVoltage": 560.0, "TemperatureMotor": 30.0}
+        return pack_frame(
+            STATUS, self._status.encode({"ProtocolVersion": 1, "TemperatureInverter": 30.0, **values})
+        )
+
+    def stop(self) -> None:
+        self._over.set()
+        self.join()
+
+
+Act = Callable[[Drive, int], None]
+
+
+def calm(drive: Drive, n: int) -> None:
+    """Feedback, and each tenth tick a status before it."""
+    if n % 10 == 0:
+        drive.end.send(drive.status(n // 10))
+    drive.end.send(drive.feedback(n))
+
+
+def now_and_then(*at: int) -> Callable[[Act], Act]:
+    """What is done instead of :func:`calm` on these SYNCs."""
+
+    def made(other: Act) -> Act:
+        return lambda drive, n: other(drive, n) if n in at else calm(drive, n)
+
+    return made
+
+
+@now_and_then(30, 40, 41)
+def wrong_crc(drive: Drive, n: int) -> None:
+    raw = bytearray(drive.feedback(n))
+    raw[-1] ^= 1
+    drive.end.send(raw)
+
+
+@now_and_then(30)
+def repeated(drive: Drive, n: int) -> None:
+    drive.counter -= 1
+    calm(drive, n)
+
+
+@now_and_then(30, 50)
+def jumped(drive: Drive, n: int) -> None:
+    drive.feedback(n)
+    calm(drive, n)
+
+
+@now_and_then(30, 31, 50)
+def silent(drive: Drive, n: int) -> None:
+    drive.feedback(n)
+
+
+@now_and_then(30, 50)
+def late(drive: Drive, n: int) -> None:
+    """After the loop has given up and sent its command, before the next SYNC."""
+    assert drive.end.recv(128)[:2] == COMMAND.to_bytes(2, "little")
+    drive.end.send(drive.feedback(n))
+
+
+@now_and_then(30, 50)
+def emergency(drive: Drive, n: int) -> None:
+    """An error, and at once its end: a frame that the kernel hands back, then the feedback."""
+    drive.end.send(pack_frame(EMERGENCY, bytes(8)))
+    calm(drive, n)
+
+
+@now_and_then(60)
+def alarm(drive: Drive, n: int) -> None:
+    drive.end.send(pack_frame(EMERGENCY, bytes((0x10, 0x43, 1, 0, 0, 0, 0, 0))))
+    calm(drive, n)
+
+
+@now_and_then(30, 45)
+def strangers(drive: Drive, n: int) -> None:
+    for other in range(6):
+        drive.end.send(pack_frame(0x500 + other, bytes(other)))
+    calm(drive, n)
+
+
+@now_and_then(60)
+def second_master(drive: Drive, n: int) -> None:
+    drive.end.send(pack_frame(COMMAND, bytes(8)))
+    calm(drive, n)
+
+
+@now_and_then(30, 31)
+def wrong_length(drive: Drive, n: int) -> None:
+    drive.end.send(pack_frame(FEEDBACK, bytes(7)))
+    drive.end.send(b"no frame")
+    calm(drive, n)
+
+
+@now_and_then(60)
+def gone(drive: Drive, n: int) -> None:
+    drive.end.close()
+
+
+@now_and_then(50)
+def deaf(drive: Drive, n: int) -> None:
+    """Nothing is read for as long as it takes to fill the queue to the drive."""
+    time.sleep(0.25)
+    calm(drive, n)
+
+
+@now_and_then(60)
+def fired(drive: Drive, n: int) -> None:
+    """The guardian fires while the loop waits for feedback."""
+    drive.words.cells[FIRED] = 1
+    calm(drive, n)
+
+
+def guardian_dies(drive: Drive, n: int) -> None:
+    if n >= 60:
+        drive.words.cells[GUARD_NS] -= GUARDIAN_LOST_NS + 10**9
+    calm(drive, n)
+
+
+@dataclass
+class Ran:
+    """What a run left."""
+
+    log: Log
+    stages: Counter[int]
+    heard: list[int]
+    ended: str
+    words: list[int]
+    failure: str = ""
+    disturbed: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.disturbed = bool((self.log.ticks["gap"] > 1).any())
+
+
+@contextlib.contextmanager
+def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """Two ends of a wire; each frame is a datagram."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with ours, theirs:
+        yield ours, theirs
+
+
+def setup_of(*more: str) -> Setup:
+    """The demo, patient with what is missing, at rest."""
+    settings = ("feedback.hold_ticks=40", "reference.w_rad_s=0.0", *more)
+    return load_setup(CONFIGS / "demo.toml", Overrides(settings=settings))
+
+
+def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) -> Ran:
+    """A run of the loop with its guardian's words, recorder and log, against that drive."""
+    request = StopRequest()
+    stages: Counter[int] = Counter()
+    words, machine = Words(), setup.machine.fresh()
+    words.cells[GUARD_NS] = time.monotonic_ns()
+    plan = Plan(PERIOD_NS, TIMEOUT_NS, "sync", ticks)
+    recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
+    recorder.await_open()
+    failure = ""
+    with ends() as (ours, theirs):
+        client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
+
+        def counted() -> Whole:
+            made = fused.whole_tick(client, words, machine, recorder, plan)
+
+            def whole(*args: Any) -> int:
+                stage = made(*args)
+                stages[stage] += 1
+                return stage
+
+            return whole
+
+        guarded, record = GuardedDrive(client, words, time.monotonic_ns), recorder.record
+        whole = counted if compiled else no_whole
+        loop = Loop(guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole)
+        drive = Drive(setup, theirs, words, act)
+        drive.start()
+        try:
+            outcome = loop.run()
+        except Exception as error:  # noqa: BLE001 - the two runs are compared in how they fail, too
+            outcome, failure = loop._outcome, f"{type(error).__name__}: {error}"
+        finally:
+            recorder.close({"ended": "in time"})
+            drive.stop()
+    log, ended = open_log(path), Reason(outcome.reason).name
+    return Ran(log, stages, drive.heard, ended, words.cells.tolist()[:5], failure)
+
+
+def both(setup: Setup, folder: Path, act: Act) -> tuple[Ran, Ran]:
+    """(by the loop's rules, compiled): undisturbed by the host."""
+    for turn in range(TURNS):
+        pair = tuple(run(setup, folder / f"{turn}-{form}.mcap", act, form) for form in (False, True))
+        if not (pair[0].disturbed or pair[1].disturbed):
+            return pair[0], pair[1]
+    pytest.fail("the host stalled in every turn")
+
+
+def assert_same(rules: Ran, compiled: Ran) -> None:
+    """Every field of every record, every frame, every event, and the end."""
+    assert (compiled.ended, compiled.failure) == (rules.ended, rules.failure)
+    assert len(compiled.log.ticks) == len(rules.log.ticks)
+    for one in FIELDS:
+        if one.name not in STAMPS:
+            theirs, ours = rules.log.ticks[one.name], compiled.log.ticks[one.name]
+            assert theirs.tobytes() == ours.tobytes(), one.name
+    at = [ran.log.ticks["t_ns"] - ran.log.ticks["t_ns"][0] for ran in (rules, compiled)]
+    assert (at[0] == at[1]).all()
+    passed = [[(f.can_id, f.data, f.received) for f in ran.log.frames] for ran in (rules, compiled)]
+    assert passed[0] == passed[1]
+    told = [[(e["k"], e["kind"], e["text"]) for e in ran.log.events] for ran in (rules, compiled)]
+    assert told[0] == told[1]
+    assert compiled.heard == rules.heard
+    assert compiled.words[ARMED] == rules.words[ARMED] and compiled.words[COUNTER] == rules.words[COUNTER]
+
+
+CASES: dict[str, tuple[Act, set[int], str]] = {
+    # what happens: the act, the stages at which ticks were left to the loop, how it ends
+    "calm": (calm, {SENT}, "STOP_REQUESTED"),
+    "wrong crc": (wrong_crc, {SENT}, "STOP_REQUESTED"),
+    "repeated counter": (repeated, {SENT}, "STOP_REQUESTED"),
+    "jump of the counter": (jumped, {SENT}, "STOP_REQUESTED"),
+    "no feedback": (silent, {SENT}, "STOP_REQUESTED"),
+    "late feedback": (late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "emergency that is over": (emergency, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "emergency": (alarm, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "strangers' frames": (strangers, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "second master": (second_master, {SENT, BEGUN}, "FOREIGN_COMMAND"),
+    "wrong length": (wrong_length, {SENT}, "STOP_REQUESTED"),
+    "the other end is gone": (gone, {SENT, BEGUN, NOT_BEGUN, DECIDED}, ""),
+    "the queue is full": (deaf, {SENT, BEGUN, NOT_BEGUN, DECIDED}, ""),
+    "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+    "the guardian dies": (guardian_dies, {SENT}, "GUARDIAN_LOST"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_compiled_tick_is_the_loops_own(name: str, tmp_path: Path) -> None:
+    act, left, ended = CASES[name]
+    rules, compiled = both(setup_of(), tmp_path, act)
+    assert_same(rules, compiled)
+    assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
+    assert not ended or compiled.ended == ended
+    assert not rules.stages
+
+
+@pytest.fixture
+def parts(tmp_path: Path) -> Iterator[Parts]:
+    """A client, its compiled tick and the other end of the wire, without a loop."""
+    setup, words = setup_of(), Words()
+    machine, plan = setup.machine.fresh(), Plan(PERIOD_NS, TIMEOUT_NS, "sync", TICKS)
+    recorder = open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "monotonic"), 1000)
+    with ends() as (ours, theirs):
+        theirs.setblocking(False)
+        client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
+        client.prepare(recorder.record[0])
+        whole = fused.whole_tick(client, words, machine, recorder, plan)
+        yield Parts(whole, words, recorder.record, theirs)
+        recorder.close({})
+
+
+@dataclass
+class Parts:
+    """What :func:`parts` makes."""
+
+    whole: Whole
+    words: Words
+    record: TickArray
+    end: socket.socket
+
+    def silent(self) -> bool:
+        """Nothing was sent, nothing stored."""
+        with pytest.raises(BlockingIOError):
+            self.end.recv(128)
+        return True
+
+
+def test_a_tick_that_is_late_by_a_period_is_the_loops(parts: Parts) -> None:
+    before = parts.record.tobytes()
+    assert parts.whole(7, time.monotonic_ns() - PERIOD_NS, 1, False) == NOT_BEGUN
+    assert parts.silent() and parts.record.tobytes() == before
+
+
+def test_nothing_is_sent_once_the_guardian_has_fired(parts: Parts) -> None:
+    parts.words.cells[FIRED] = 1
+    assert parts.whole(7, time.monotonic_ns(), 1, False) == NOT_BEGUN
+    assert parts.silent() and parts.words.cells[BEAT_NS] > 0
+
+
+def test_a_signal_ends_the_sleep(parts: Parts) -> None:
+    """So that its handler can run before the tick."""
+    seen: list[int] = []
+    before = signal.signal(signal.SIGALRM, lambda number, _: seen.append(number))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        begin_ns = time.monotonic_ns()
+        assert parts.whole(7, begin_ns + 20 * 10**9, 1, False) == NOT_BEGUN
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert seen == [signal.SIGALRM] and time.monotonic_ns() - begin_ns < 10 * 10**9
+    assert parts.silent()
+
+
+def test_a_tick_sleeps_to_its_deadline(parts: Parts) -> None:
+    deadline_ns = time.monotonic_ns() + 30_000_000
+    parts.whole(7, deadline_ns, 3, True)
+    assert CLASSIC.unpack(parts.end.recv(128))[0] == SYNC
+    tick = parts.record[0]
+    assert (tick["k"], tick["t_ns"], tick["request"], tick["log_failed"]) == (7, deadline_ns, 3, 1)
+    assert (tick["gap"], tick["skipped"]) == (1, 0)
+    stamps = [tick[name] for name in ("lateness_ns", "received_ns", "computed_ns", "sent_ns")]
+    assert stamps == sorted(stamps) and stamps[0] >= 0 and stamps[1] >= TIMEOUT_NS
+
+
+def test_what_has_no_sync_or_no_socket_is_the_loops(tmp_path: Path, channel: str) -> None:
+    setup = setup_of()
+    machine, recorder = (
+        setup.machine,
+        open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "x"), 1000),
+    )
+    other = open_link(BusSettings("virtual", channel))
+    with ends() as (ours, _):
+        for link, pacing in ((SocketLink(None, ours, ours), "feedback"), (other, "sync")):
+            client = DriveClient(link, setup.database)
+            client.prepare(recorder.record[0])
+            plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
+            assert fused.whole_tick(client, None, machine, recorder, plan) is none_compiled
+    other.close()
+    recorder.close({})
