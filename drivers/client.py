@@ -41,6 +41,7 @@ from drivers.posix import (
     DRAIN_MOST,
     EXCHANGED,
     FLAGS,
+    LATE,
     PENDING,
     REFUSED_COMMAND,
     SEEN,
@@ -244,7 +245,10 @@ class DriveClient:
     def _take_late(self, tick: Any) -> None:
         self._late = True
         try:
-            self.receive(tick, 0)
+            if code := self._begun(LATE):
+                self._judge(code, 0)
+            else:
+                self.receive(tick, 0)
         finally:
             self._late = False
             self._cells[_GOT] = 0

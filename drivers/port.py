@@ -13,10 +13,10 @@ from drivers.bus import SocketLink
 from drivers.jit import entry, places_of
 from drivers.posix import (
     ARRAYS,
-    COMMANDED,
     DRAIN_MOST,
     FLAGS,
     FLAGS_AT,
+    LATE,
     MORE,
     command,
     drain,
@@ -32,7 +32,7 @@ class SocketPort:
     """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
 
     def __init__(self, link: SocketLink, shared: Arrays) -> None:
-        io = np.zeros(COMMANDED + 1, np.int64)
+        io = np.zeros(LATE + 1, np.int64)
         self.io: Any = io.data
         self.places: dict[Any, npt.NDArray[np.int64]] = {}
         """What each kernel is called with."""
@@ -43,7 +43,8 @@ class SocketPort:
         """The compiled form; the call that makes it, with ``free``, leads nowhere and leaves no trace."""
         arrays = self._shared | own
         self._alive[kernel] = arrays
-        nowhere = {"fds": np.full(4, -1, np.int32), "state": np.zeros(1, STATE)}
+        io, state = np.zeros_like(self.io), np.zeros(1, STATE)
+        nowhere = {"fds": np.full(4, -1, np.int32), "io": io, "state": state}
         compiled = entry(kernel, places_of(arrays | nowhere, ARRAYS), *known, *free)
         self.places[kernel] = places_of(arrays, ARRAYS)
         return partial(compiled, self.places[kernel], *known)
@@ -60,7 +61,7 @@ class SocketPort:
         self.io[FLAGS], self.io[MORE] = 0, DRAIN_MOST
 
     def begun(self, what: int) -> int:
-        """What an EXCHANGED or COMMANDED that a caller of the kernels has begun came to; 0 for none."""
+        """What an EXCHANGED, COMMANDED or LATE that a kernel has begun came to; 0 for none."""
         code: int = self.io[what]
         self.io[what] = 0
         return code

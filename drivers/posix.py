@@ -45,7 +45,7 @@ REFUSED_COMMAND: Final = -1000
 UNSENT: Final = -2000
 """What -errno of a SYNC that was not sent is added to."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED = range(7)
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE = range(8)
 DRAIN_MOST: Final = 256
 """Frames that are still read once the time has passed; a flood can't exceed it."""
 
@@ -152,15 +152,20 @@ def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
 
 @waiting
 def exchange(places: Any, size: int, deadline_ns: int) -> Any:
-    """Send SYNC with its counter and :func:`drain`, where nothing stands in the way: else PENDING.
+    """Take what waits as late, send SYNC with its counter and :func:`drain`; PENDING where SYNC must wait.
 
-    In the way are frames that wait to be taken as late ones, flags to be told, a bus that was down. Returns
-    what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
+    It waits for flags to be told, a bus that was down, and what can't be judged of the late frames, which is
+    in ``IO`` at LATE then. Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
     state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
     s = state[0]
-    if s["pending"] != 0 or s["down"] != 0 or wait(fds, times, 0) != 0:
+    if s["pending"] != 0 or s["down"] != 0:
+        return PENDING
+    s["got"] = 0
+    code = drain(places, 0, True)
+    if code != DONE:
+        array_at(places, IO, I8)[LATE] = code
         return PENDING
     s["got"] = 0
     s["syncs"] = s["syncs"] % SYNC_COUNTS + 1

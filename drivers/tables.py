@@ -8,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.binding import Binding, Bound
+from drivers.codec import Message
 from drivers.frames import SOURCES, STATUS
 from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
 from drivers.mapping import MEASURED, RECEIVED
 from drivers.signal import Signal
-from drivers.wire import FD_BYTES, MESSAGE, SIGNAL, STATE_RAW
+from drivers.wire import FD_BYTES, MESSAGE, SIGNAL, STATE_RAW, WATCHED
 
 Records = npt.NDArray[np.void]
 Row = tuple[Signal, int, int, int, bool]
@@ -45,13 +46,20 @@ class Tables:
              message.fd)
         )  # fmt: skip
 
+    def watch(self, message: Message) -> None:
+        """Add a message that is known by its identifier alone."""
+        self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False))
+
     def records(self) -> tuple[Records, Records]:
         """(messages, signals) as the kernels take them."""
         return np.array(self._messages, MESSAGE), np.array(self._signals, SIGNAL)
 
 
 def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records, Records, int]:
-    """(messages, signals, bits of all that measure) for :func:`drivers.wire.take` into records ``tick``."""
+    """(messages, signals, bits of all that measure) for :func:`drivers.wire.take` into records ``tick``.
+
+    Watched besides: what only the controller itself may send, and the drive's emergencies.
+    """
     tables, needed = Tables(), 0
     for index, bound in enumerate(binding.incoming):
         parts = {part for part, _ in bound.parts}
@@ -63,6 +71,10 @@ def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records,
         ]
         seen = STATUS if not bit and "v_dc" in parts else 0
         tables.add(bound, rows, bit, seen | (STATE_RAW if "state" in parts and binding.map.states else 0))
+    watched = [bound.message for bound in binding.outgoing] + [binding.sync, binding.emergency]
+    for message in watched:
+        if message is not None:
+            tables.watch(message)
     return *tables.records(), needed
 
 

@@ -22,11 +22,14 @@ from drivers.frames import (
     LENGTH_ERROR,
 )
 from drivers.jit import jit
+from drivers.local import ERR_FLAG
 
 STATE_RAW: Final = 1 << 16
 """What :func:`take` flags when the state that it wrote to the tick is the drive's own, to be translated."""
 UNKNOWN: Final = -1
-"""What :func:`take` returns for a frame of no message in the tables."""
+"""What :func:`take` returns for a frame that measures nothing and yet says something to its caller."""
+WATCHED: Final = -1
+"""The ``bit`` of a message that is none to take, but of which :func:`take` returns UNKNOWN."""
 REFUSED: Final = -1
 """What :func:`encode` returns for a value that a signal can't carry."""
 CLASSIC_BYTES: Final = 16
@@ -243,7 +246,8 @@ def take(
     """Check a frame of ``size`` bytes on the socket and apply it to the tick, whole or not at all.
 
     ``late``: the frame is checked and counted; a measurement is not applied. ``last``: each message's last
-    counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, or UNKNOWN.
+    counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, or UNKNOWN;
+    other nodes' frames have no flags.
     """
     s = state[0]
     if size not in (CLASSIC_BYTES, FD_BYTES) or int(raw[4]) > size - DATA_AT:
@@ -253,8 +257,10 @@ def take(
         s["logged"] += 1
     index = find(raw, messages)
     if index < 0:
-        return UNKNOWN
+        return UNKNOWN if identifier(raw) & ERR_FLAG else 0
     m = messages[index]
+    if m["bit"] == WATCHED:
+        return UNKNOWN
     if int(raw[4]) != m["length"] or (size == CLASSIC_BYTES and m["length"] > 8):
         return LENGTH_ERROR
     if not is_valid(raw, m):

@@ -27,12 +27,23 @@ from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.kernels import Kernels
 from firmware_model.plant import State
-from firmware_model.station import ANSWER, IDLE_NS, LAST_NS, STARTED, UNSENT, Station, station
+from firmware_model.station import (
+    ANSWER,
+    BEAT_NS,
+    HEARTBEAT_NS,
+    IDLE_NS,
+    LAST_NS,
+    STARTED,
+    UNSENT,
+    Station,
+    station,
+)
 
 Frames = HouseFrames | InverterFrames
 
 BLACK_BOX = "black box: "
-HEARTBEAT_NS = 100_000_000
+LOOK_NS = 1_000_000_000
+"""So long a busy drive serves the bus without asking whether to stop; a signal asks at once."""
 RUN_OUT_NS = 500_000_000
 Protocol = Literal["house", "inverter"]
 
@@ -80,7 +91,7 @@ class Node:
         self._station: Station | None = None
         if pacing == "sync" and faults is None:
             self._station = station(link, self._frames, records, period_ns if clock == "lockstep" else 0)
-        self._cells: Any = (self._station.cells if self._station else np.zeros(UNSENT + 1, np.int64)).data
+        self._cells: Any = (self._station.cells if self._station else np.zeros(BEAT_NS + 1, np.int64)).data
 
     @property
     def ignored(self) -> Counter[str]:
@@ -105,9 +116,12 @@ class Node:
     def run(self, stopped: Callable[[], bool]) -> None:
         """Serve the bus until ``stopped()``; boot-up message first, heartbeat every 100 ms."""
         self._send(self._frames.boot())
-        self._cells[LAST_NS] = next_beat = next_cycle = time.monotonic_ns()
+        self._cells[LAST_NS] = self._cells[BEAT_NS] = next_beat = next_cycle = time.monotonic_ns()
         while not stopped():
             now = time.monotonic_ns()
+            if self._station is not None:
+                self._attend(self._station, now + LOOK_NS)
+                continue
             if now >= next_beat:
                 next_beat = now + HEARTBEAT_NS
                 self._send(self._frames.beat())
@@ -115,10 +129,7 @@ class Node:
                 next_cycle += self._period_ns * (1 + (now - next_cycle) // self._period_ns)
                 self.sync(now)
             wake = min(next_beat, next_cycle) if self._pacing == "cyclic" else next_beat
-            if self._station is None:
-                self._serve(min(max(wake - now, 0), IDLE_NS))
-            else:
-                self._attend(self._station, wake)
+            self._serve(min(max(wake - now, 0), IDLE_NS))
         self._run_out()
 
     def _run_out(self) -> None:

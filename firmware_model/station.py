@@ -18,6 +18,7 @@ import numpy.typing as npt
 from drivers.binding import Bound
 from drivers.bus import Link, SocketLink
 from drivers.codec import Message
+from drivers.local import pack_frame
 from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, transmit, wait
 from drivers.tables import Tables, laid_out
 from drivers.wire import (
@@ -46,9 +47,12 @@ IDLE_NS: Final = 5_000_000
 ANSWER: Final = 1
 """What :func:`attend` returns when a SYNC was taken and the caller is to send what it is answered with; 0:
 the time is over, or it was silent. Sizes of frames are more than both."""
-LAST_NS, STARTED, UNSENT, SYNC_ID, PERIOD_NS = range(5)
-"""Cells: when the plant was moved last, whether its time has begun, answers that the bus did not take; of the
-configuration, the identifier of SYNC and the period of lockstep, 0 in real time."""
+HEARTBEAT_NS: Final = 100_000_000
+LAST_NS, STARTED, UNSENT, BEAT_NS, SYNC_ID, PERIOD_NS = range(6)
+"""Cells: when the plant was moved last, whether its time has begun, frames that the bus did not take, when
+the next heartbeat is due; of the configuration, the identifier of SYNC and the period of lockstep, 0 in real
+time."""
+NEVER_NS: Final = 2**62
 VOLTAGE, LOAD, STATUS = 1, 2, 4
 """What a message carries, as bits."""
 _MODE, _CONTROLWORD, _U_Q, _U_D, _ENABLE, _T_L = range(1, 7)
@@ -63,13 +67,13 @@ ARRAYS: Final = {
     "params": PARAMS, "state": STATE, "sample": SAMPLE, "whole": I8, "real": F8, "fields": I8, "values": F8,
     "fds": I4, "times": I8, "cells": I8, "counters": I8, "raw": U1, "out": U1, "words": U4,
     "wire": WIRE_STATE, "log": FRAME,
-    "taken": MESSAGE, "taken_signals": SIGNAL, "sent": MESSAGE, "sent_signals": SIGNAL,
+    "taken": MESSAGE, "taken_signals": SIGNAL, "sent": MESSAGE, "sent_signals": SIGNAL, "beat": U1,
 }  # fmt: skip
 """The arrays behind the places of a call, in their order. ``whole`` and ``real`` are the sample as words of
 eight bytes, ``fields`` which of them go to the values, ``out`` room for each answer."""
 (
     _PARAMS, _STATE, _SAMPLE, _WHOLE, _REAL, _FIELDS, _VALUES, _FDS, _TIMES, _CELLS, _COUNTERS, _RAW, _OUT,
-    _WORDS, _WIRE, _LOG, _TAKEN, _TAKEN_SIGNALS, _SENT, _SENT_SIGNALS,
+    _WORDS, _WIRE, _LOG, _TAKEN, _TAKEN_SIGNALS, _SENT, _SENT_SIGNALS, _BEAT,
 ) = range(len(ARRAYS))  # fmt: skip
 
 
@@ -83,8 +87,10 @@ class Station:
         self, link: SocketLink, frames: HouseFrames, records: tuple[Record, Record, Record], period_ns: int
     ) -> None:
         params, state, sample = records
-        self.cells = np.zeros(5, np.int64)
+        self.cells = np.zeros(PERIOD_NS + 1, np.int64)
         self.cells[SYNC_ID], self.cells[PERIOD_NS] = frames.sync_id or 0, period_ns
+        self.cells[BEAT_NS] = NEVER_NS
+        [(beat_id, beat, _)] = frames.beat()
         self.raw = np.zeros(FD_BYTES + DATA_AT, np.uint8)
         taken, sent, fields = _taken(frames), _sent(frames), _fields(frames)
         heads = [laid_out(message.send_id, message.length, message.fd) for message, _ in frames.answers]
@@ -96,6 +102,7 @@ class Station:
             "counters": frames.counters, "raw": self.raw, "out": np.concatenate(heads),
             "words": np.zeros(2, np.uint32), "wire": np.zeros(1, WIRE_STATE), "log": np.zeros(0, FRAME),
             "taken": taken[0], "taken_signals": taken[1], "sent": sent[0], "sent_signals": sent[1],
+            "beat": np.frombuffer(pack_frame(beat_id, beat), np.uint8),
         }  # fmt: skip
         places = places_of(self._alive, ARRAYS)
         self.attend = partial(entry(attend, places, 0), places)
@@ -176,6 +183,15 @@ def send_answer(places: Any, status_due: int) -> bool:
 
 
 @jit
+def send_beat(places: Any, now_ns: int) -> None:
+    """The heartbeat, and when the next is due."""
+    fds, cells, beat = array_at(places, _FDS, I4), array_at(places, _CELLS, I8), array_at(places, _BEAT, U1)
+    wire, log = array_at(places, _WIRE, WIRE_STATE), array_at(places, _LOG, FRAME)
+    cells[UNSENT] += transmit(fds, beat, len(beat), wire, log) != DONE
+    cells[BEAT_NS] = now_ns + HEARTBEAT_NS
+
+
+@jit
 def take_sync(places: Any, now_ns: int) -> int:
     """Move the plant on, latch, sample, answer. Returns DONE or ANSWER."""
     p, s = array_at(places, _PARAMS, PARAMS)[0], array_at(places, _STATE, STATE)[0]
@@ -224,16 +240,21 @@ def take_command(places: Any, index: int, now_ns: int) -> bool:
 def attend(places: Any, until_ns: int) -> Any:
     """Take frames until ``until_ns`` [ns of CLOCK_MONOTONIC], silence, or one that the caller is to judge.
 
-    Returns ANSWER, 0, the size of that frame in ``raw``, or -errno.
+    Neither a heartbeat nor the caller may keep a SYNC waiting: their time is when the command has come that
+    follows one. Returns ANSWER, 0, the size of that frame in ``raw``, or -errno.
     """
     fds, times = array_at(places, _FDS, I4), array_at(places, _TIMES, I8)
     cells, raw = array_at(places, _CELLS, I8), array_at(places, _RAW, U1)
     messages = array_at(places, _TAKEN, MESSAGE)
+    expecting = False
     while True:
-        left_ns = until_ns - now_ns(times)
-        if left_ns <= 0:
-            return 0
-        ready = wait(fds, times, min(left_ns, IDLE_NS))
+        left_ns = min(until_ns, cells[BEAT_NS]) - now_ns(times)
+        if left_ns <= 0 and (not expecting or left_ns < -IDLE_NS):
+            if cells[BEAT_NS] > until_ns:
+                return 0
+            send_beat(places, now_ns(times))
+            continue
+        ready = wait(fds, times, min(left_ns, IDLE_NS) if left_ns > 0 else IDLE_NS)
         if ready <= 0:
             return 0 if ready == -EINTR else ready
         size = receive(fds, raw)
@@ -244,7 +265,9 @@ def attend(places: Any, until_ns: int) -> Any:
         if identifier(raw) == cells[SYNC_ID] and int(raw[4]) <= 1:  # CANopen: no data or the counter
             if take_sync(places, now_ns(times)) != DONE:
                 return ANSWER
+            expecting = True
             continue
+        expecting = False
         index = find(raw, messages)
         if index < 0 or not take_command(places, index, now_ns(times)):
             return size

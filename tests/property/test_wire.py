@@ -13,7 +13,7 @@ from drivers.binding import Binding, Bound, bind
 from drivers.codec import Database
 from drivers.errors import EncodeError
 from drivers.frames import COUNTER_JUMP, COUNTER_REPEATED, CRC_ERROR, FRESH, LENGTH_ERROR, SOURCES
-from drivers.local import FD, pack_frame
+from drivers.local import ERR_FLAG, FD, pack_frame
 from drivers.mapping import RECEIVED, house_map
 from drivers.tables import incoming_tables, laid_out, outgoing_tables
 from drivers.wire import FRAME, MESSAGE, ROOM, SIGNAL, STATE, UNKNOWN, encode, phys_of, take
@@ -140,7 +140,15 @@ def test_a_frame_of_another_length_or_size_is_not_taken() -> None:
     assert taker.take(good[:4] + bytes([64]) + good[5:]) == 0, "a classic frame of 64 bytes is no frame"
     for size in (12, 17, 38, 71):
         assert taker.take(FD.pack(feedback.send_id, 8, 4, good[8:])[:size]) == 0, "no frame has that size"
-    assert taker.take(pack_frame(0x123, b"")) == UNKNOWN
+    assert taker.take(pack_frame(0x123, b"")) == 0, "another node's"
+    assert taker.take(pack_frame(0x123 | ERR_FLAG, bytes(8))) == UNKNOWN
+    for message in (
+        BINDINGS["classic"].command.message,
+        BINDINGS["classic"].sync,
+        BINDINGS["classic"].emergency,
+    ):
+        assert message is not None
+        assert taker.take(pack_frame(message.send_id, b"")) == UNKNOWN, message.name
     assert taker.ticks.tobytes() == before
     assert taker.take(FD.pack(feedback.send_id, 8, 4, good[8:])) & FRESH, "the same data in an FD frame"
 
