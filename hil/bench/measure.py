@@ -37,6 +37,7 @@ TRIES: Final = 3
 """A stall of the whole machine spoils what either loop shows; each has so many probes to reach a rate."""
 RATES: Final = (1000, 1250, 1600, 2000, 2500, 3200, 4000, 5000, 6250, 8000, 10_000)
 """A loop's period is a whole number of nanoseconds."""
+LOOPS: Final = ("hil", "bare")
 Say = Callable[[str], None]
 Probe = Callable[[str, int], list[float]]
 """Shares in time of each second, of the loop by its name at a rate [Hz]."""
@@ -159,28 +160,44 @@ def _rates(one: Stand, length: Length, run: LoopRun, floor: BareRun, say: Say) -
     known = {"hil": run.in_time, "bare": floor.in_time}
     rates = [rate for rate in length.rates if rate > run.rate_hz]
     found, tried = rates_that_hold(rates, probe)
-    own, bare = (found[loop] or (run.rate_hz if known[loop] >= GOOD else 0) for loop in ("hil", "bare"))
+    own, bare = (found[loop] or (run.rate_hz if known[loop] >= GOOD else 0) for loop in LOOPS)
     ratio = own / bare if bare else None
-    return {"rate_hz": own, "bare_rate_hz": bare, "rate_ratio": ratio, "tried": tried}
+    medians = {"in_time_at": at_rates(tried)}
+    return {"rate_hz": own, "bare_rate_hz": bare, "rate_ratio": ratio, "tried": tried} | medians
 
 
 def rates_that_hold(rates: Sequence[int], probe: Probe) -> tuple[dict[str, int], list[dict[str, Any]]]:
     """(highest rate that holds by loop, 0 for none; every probe).
 
     A rate holds when in one second of up to :data:`TRIES` probes enough ticks were in time: what else the
-    machine does only takes away, so the quietest second says most of the loop.
+    machine does only takes away, so the quietest second says most of the loop. Both loops are probed by
+    turns at a rate that either needs, until both hold: the machine is another one a minute later.
     """
     tried: list[dict[str, Any]] = []
+    holding: dict[int, set[str]] = {}
 
     def holds(loop: str, rate_hz: int) -> bool:
-        for _ in range(TRIES):
-            shares = probe(loop, rate_hz)
-            tried.append({"loop": loop, "rate_hz": rate_hz, "in_time": shares})
-            if max(shares, default=0.0) >= GOOD:
-                return True
-        return False
+        if rate_hz not in holding:
+            held = holding[rate_hz] = set()
+            for _ in range(TRIES):
+                for name in LOOPS:
+                    shares = probe(name, rate_hz)
+                    tried.append({"loop": name, "rate_hz": rate_hz, "in_time": shares})
+                    held |= {name} if max(shares, default=0.0) >= GOOD else set()
+                if held == set(LOOPS):
+                    break
+        return loop in holding[rate_hz]
 
-    return {loop: highest(rates, partial(holds, loop)) for loop in ("hil", "bare")}, tried
+    return {loop: highest(rates, partial(holds, loop)) for loop in LOOPS}, tried
+
+
+def at_rates(tried: Sequence[dict[str, Any]]) -> dict[str, dict[str, float]]:
+    """By rate [Hz], of each loop, how many ticks were in time in the median second of all its probes."""
+    seconds: dict[tuple[int, str], list[float]] = {}
+    for one in tried:
+        seconds.setdefault((one["rate_hz"], one["loop"]), []).extend(one["in_time"])
+    rates = sorted({rate_hz for rate_hz, _ in seconds})
+    return {str(rate): {loop: float(np.median(seconds[rate, loop])) for loop in LOOPS} for rate in rates}
 
 
 def highest(rates: Sequence[int], holds: Callable[[int], bool]) -> int:

@@ -40,6 +40,7 @@ def rows(result: dict[str, Any]) -> list[tuple[str, str]]:
     out = [
         ("processor time a tick", f"{result['processor_ratio']:.2f} x the bare loop's: " + _cost(result)),
         ("rate", _rate(result)),
+        *([("in time, median second", _at_rates(result["in_time_at"]))] if result["in_time_at"] else []),
         ("lateness at p99.9", _lateness_ratio(result)),
         ("lateness", _percentiles(result["lateness_us"])),
         ("cyclictest", _percentiles(result["cyclictest_us"]) + f" ({result['cyclictest']})"),
@@ -68,6 +69,12 @@ def _rate(result: dict[str, Any]) -> str:
     text = f"{ratio:.2f} x the bare loop's: " if ratio is not None else ""
     text += f"{result['rate_hz']} Hz of {result['bare_rate_hz']} Hz, 99.9 % in time in the best second"
     return text if result["tried"] else text + " (other rates not tried)"
+
+
+def _at_rates(at: dict[str, dict[str, float]]) -> str:
+    """Both loops by turns at each rate."""
+    each = [f"{rate} Hz {100 * of['hil']:.2f} ({100 * of['bare']:.2f})" for rate, of in at.items()]
+    return ", ".join(each) + " %, in brackets the bare loop by turns with it"
 
 
 def _lateness_ratio(result: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ import pytest
 from hil.bench.cyclictest import MISSING, cyclictest, parse
 from hil.bench.histogram import TOP_US, Histogram
 from hil.bench.machine import machine_facts, resident_kib
-from hil.bench.measure import TRIES, highest, phases, rates_that_hold
+from hil.bench.measure import LOOPS, TRIES, at_rates, highest, phases, rates_that_hold
 from hil.bench.meter import by_phase, reading_ns
 from hil.bench.processes import awake, seconds_in_time, share_in_time
 from hil.bench.view import ratios, read_result
@@ -95,18 +95,30 @@ def test_the_highest_rate_is_found_with_few_tries(limit: int) -> None:
 
 
 def test_a_stall_that_spoils_a_probe_does_not_decide_on_a_rate() -> None:
-    """Each rate has three probes, in one of which a second must hold; the first such probe is the last."""
+    """Each rate has three probes of each loop, by turns, in one of which a second must hold."""
     top, spoiled, asked = {"hil": 4000, "bare": 5000}, {("hil", 4000): 2, ("bare", 5000): 3}, Counter[Any]()
+    turns: list[str] = []
 
     def probe(loop: str, rate_hz: int) -> list[float]:
         asked[loop, rate_hz] += 1
+        turns.append(loop)
         quiet = asked[loop, rate_hz] > spoiled.get((loop, rate_hz), 0)
         return [0.99, 0.9995 if quiet and rate_hz <= top[loop] else 0.98]
 
     found, tried = rates_that_hold([2000, 3000, 4000, 5000, 6000], probe)
     assert found == {"hil": 4000, "bare": 4000}
-    assert asked["hil", 4000] == TRIES and asked["bare", 5000] == TRIES and asked["bare", 4000] == 1
+    assert (
+        all(asked[loop, rate] == TRIES for loop in LOOPS for rate in (4000, 5000)) and turns == [*LOOPS] * 6
+    )
     assert len(tried) == asked.total() and {max(one["in_time"]) for one in tried} == {0.9995, 0.99}
+    assert at_rates(tried) == {
+        "4000": {"hil": 0.99, "bare": pytest.approx(0.99475)},
+        "5000": {"hil": pytest.approx(0.985), "bare": pytest.approx(0.985)},
+    }
+    found, tried = rates_that_hold(
+        [2000, 3000, 4000, 5000, 6000], lambda loop, rate_hz: [float(rate_hz <= top[loop])]
+    )
+    assert found == top and len(tried) == 2 * (1 + TRIES + TRIES)
 
 
 def test_seconds_in_time_count_skipped_periods_and_leave_out_a_part() -> None:
