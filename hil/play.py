@@ -6,13 +6,18 @@ program's recording nobody can say, so every frame may be one.
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import gc
 import itertools
 import math
+import os
+import signal
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import IO, Any, Final, Literal, NamedTuple, NoReturn, Protocol
 
 import can
 import numpy as np
@@ -27,6 +32,11 @@ EXTENDED: Final = 0x80000000
 LATE_NS: Final = 1_000_000
 LEAD_NS: Final = 20_000_000
 _BINS: Final = 100_000
+_RECORD: Final = struct.Struct("<BqIBBB64s")
+"""What goes through the pipe of :func:`ahead`: kind, t_ns, can_id, size, fd, command, data."""
+_FRAME, _ROUND, _DONE, _FAILED = range(4)
+_PIPE_BYTES: Final = 1 << 20
+_NICE: Final = 5
 
 
 class Played(NamedTuple):
@@ -178,6 +188,69 @@ def play(
     finally:
         gc.unfreeze()
     return result
+
+
+@contextlib.contextmanager
+def ahead(rounds: Iterable[Iterable[Played]]) -> Iterator[Iterator[Iterator[Played]]]:
+    """The same rounds, read by a process of its own: a frame is there when its time comes.
+
+    To read a chunk of a log takes milliseconds, for which the frames before it would have to wait.
+    """
+    ours, theirs = os.pipe()
+    with contextlib.suppress(OSError):  # as it is by default, it holds a few hundred frames
+        fcntl.fcntl(theirs, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+    pid = os.fork()
+    if pid == 0:
+        os.close(ours)
+        _read(rounds, theirs)
+    os.close(theirs)
+    try:
+        with os.fdopen(ours, "rb", _PIPE_BYTES // 16) as stream:
+            yield _rounds(stream)
+    finally:
+        os.waitpid(pid, 0)
+
+
+def _read(rounds: Iterable[Iterable[Played]], pipe: int) -> NoReturn:
+    """The reading process: until all is written, or nobody reads any more."""
+    try:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the player's business; its end of the pipe ends this
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        os.nice(_NICE)
+        with contextlib.suppress(BrokenPipeError), os.fdopen(pipe, "wb", _PIPE_BYTES // 16) as stream:
+            try:
+                for frames in rounds:
+                    for t_ns, can_id, data, fd, command in frames:
+                        stream.write(_RECORD.pack(_FRAME, t_ns, can_id, len(data), fd, command, data))
+                    stream.write(_RECORD.pack(_ROUND, 0, 0, 0, 0, 0, b""))
+                stream.write(_RECORD.pack(_DONE, 0, 0, 0, 0, 0, b""))
+            except LogError as error:
+                text = str(error).encode()
+                stream.write(_RECORD.pack(_FAILED, len(text), 0, 0, 0, 0, b"") + text)
+    finally:
+        os._exit(0)
+
+
+def _rounds(stream: IO[bytes]) -> Iterator[Iterator[Played]]:
+    """What comes through the pipe, one round after the other, each to be taken to its end; the last is empty.
+
+    Raises the reader's LogError, or one of its own when the reader has died.
+    """
+    kind = _ROUND
+
+    def one() -> Iterator[Played]:
+        nonlocal kind
+        while len(raw := stream.read(_RECORD.size)) == _RECORD.size:
+            kind, t_ns, can_id, size, fd, command, data = _RECORD.unpack(raw)
+            if kind == _FAILED:
+                raise LogError(stream.read(t_ns).decode())
+            if kind != _FRAME:
+                return
+            yield Played(t_ns, can_id, data[:size], bool(fd), bool(command))
+        raise LogError("the process that reads the recording has died")
+
+    while kind == _ROUND:
+        yield one()
 
 
 def _one_round(

@@ -79,7 +79,7 @@ def cmd_play(args: argparse.Namespace) -> int:
     from hil.clock import RealClock
     from hil.errors import HilError
     from hil.log.errors import LogError
-    from hil.play import Choice, Source, chosen, play
+    from hil.play import Choice, Source, ahead, chosen, play
     from hil.view import key_values, show
 
     if not 0.0 <= args.from_s <= args.to_s:
@@ -89,8 +89,10 @@ def cmd_play(args: argparse.Namespace) -> int:
     only_drive = source.roles_known and args.direction == "rx"
     allowed = only_drive or (args.transmit_commands and _confirmed(args))
     bus = (args.interface, args.channel, args.bitrate, args.fd)
-    with sending_bus(*bus, real_allowed=allowed) as send, _keys(args.paused) as before:
-        rounds = (chosen(source, choice) for _ in range(args.loop))
+    with contextlib.ExitStack() as stack:
+        send = stack.enter_context(sending_bus(*bus, real_allowed=allowed))
+        rounds = stack.enter_context(ahead(chosen(source, choice) for _ in range(args.loop)))
+        before = stack.enter_context(_keys(args.paused))
         result = play(rounds, send, RealClock(), rate=args.rate, before=before)
     if not (result.sent or result.interrupted):
         raise LogError(f"{args.log}: no frame was chosen; see --direction, --id, --from and --to")

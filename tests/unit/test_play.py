@@ -6,6 +6,7 @@ import gc
 import json
 import os
 import pty
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from hil.commands.play import Keys
 from hil.convert.export import export
 from hil.log.errors import LogError
 from hil.log.schema import FRAME, Records
-from hil.play import LEAD_NS, Choice, Played, Source, chosen, play
+from hil.play import LEAD_NS, Choice, Played, Source, ahead, chosen, play
 from tests.logfiles import some_ticks, write_log
 
 IDS = ((0x080, 0, 1), (0x181, 1, 8), (0x201, 0, 8))
@@ -77,6 +78,42 @@ def test_rate_loop_window_direction_and_identifiers(path: Path) -> None:
     assert set(np.diff([t for t, *_ in bus.sent[:20]]).tolist()) == {25_000, 225_000}
     bus, _ = played(path, Choice("tx", frozenset({0x201})))
     assert {can_id for _, can_id, _, _ in bus.sent} == {0x201} and len(bus.sent) == 100
+
+
+def test_frames_read_ahead_are_the_same(path: Path) -> None:
+    source = Source(path)
+    rounds = [
+        list(chosen(source, Choice("both"))),
+        [],
+        [Played(-1, 0x9FFFFFFF, bytes(range(64)), True, True)],
+    ]
+    with ahead(rounds) as read:
+        assert [list(frames) for frames in read] == [*rounds, []]
+
+
+def test_what_the_reader_can_not_read_is_said_where_it_is_played(path: Path) -> None:
+    def broken() -> Iterator[Played]:
+        yield from chosen(Source(path), Choice())
+        raise LogError("the rest is torn")
+
+    clock = FakeClock()
+    bus = Bus(clock)
+    with pytest.raises(LogError, match="the rest is torn"), ahead([broken()]) as read:
+        play(read, bus, clock)
+    assert len(bus.sent) == 100
+
+
+def test_a_reader_that_dies_is_said_and_one_that_nobody_listens_to_ends() -> None:
+    def endless() -> Iterator[Played]:
+        while True:
+            yield Played(0, 1, b"", False, False)
+
+    with ahead([endless()]) as read:
+        frames = next(read)
+        assert next(frames).can_id == 1
+    dying = (os.kill(os.getpid(), signal.SIGKILL) for _ in range(1))
+    with pytest.raises(LogError, match="has died"), ahead(dying) as read:  # type: ignore[arg-type]
+        list(next(read))
 
 
 def test_lateness_is_counted_and_does_not_move_later_deadlines(path: Path) -> None:
