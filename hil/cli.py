@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from typing import NoReturn
 
 from hil.commands import bench, convert, demo, emulated, faults, log, paper, play, replay, report, run, watch
 from hil.commands.common import EXIT_REFUSED, Commands, say
@@ -44,7 +49,8 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; every refusal is one clear line on standard error and exit code 2."""
     args = _parser().parse_args(argv)
     try:
-        return int(args.run(args))
+        with _sigterm_unwinds():
+            return int(args.run(args))
     except KeyboardInterrupt:
         say("hil: interrupted")
         return 130
@@ -53,6 +59,23 @@ def main(argv: list[str] | None = None) -> int:
             raise
         say("\n".join(f"hil: {line}" for line in _words(error).splitlines()))
         return EXIT_REFUSED
+
+
+@contextlib.contextmanager
+def _sigterm_unwinds() -> Iterator[None]:
+    """SIGTERM ends a command as an exception does, so that nothing half-written stays; a run has its own."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+
+
+def _terminate(*_: object) -> NoReturn:
+    raise SystemExit(128 + signal.SIGTERM)
 
 
 def _words(error: Exception) -> str:
