@@ -105,3 +105,9 @@ def array_at(places: Any, index: int, dtype: Any) -> Any:
     cache; it unpacks one of places instead. Compiled code only: the interpreter can't follow an address.
     """
     return carray(_behind(places[index, 0]), (places[index, 1],), dtype)
+
+
+@jit
+def places_at(places: Any, index: int) -> Any:
+    """The table of places at a place: of its plain row, as :func:`place_of` takes it."""
+    return carray(_behind(places[index, 0]), (places[index, 1] // 2, 2), np.int64)

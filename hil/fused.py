@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.client import FLUSH_AT, DriveClient
-from drivers.jit import COMPILED, array_at, entry, jit, place_of, waiting
+from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
 from drivers.posix import (
-    ARRAYS,
     COMMANDED,
     DONE,
     EINTR,
@@ -29,7 +28,6 @@ from drivers.posix import (
     IO,
     PENDING,
     STATES,
-    TIMES,
     command,
     exchange,
     now_ns,
@@ -37,7 +35,7 @@ from drivers.posix import (
 from drivers.wire import STATE
 from hil.design import Machine
 from hil.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
-from hil.kernel import PLACED, whole_at
+from hil.kernel import whole_at
 from hil.log.push import push
 from hil.log.recorder import Recorder
 from hil.loop import BEGUN, DECIDED, MAX_NS, NOT_BEGUN, RECORDED, SENT, Plan, Whole, none_compiled
@@ -62,14 +60,8 @@ _clock_nanosleep = _types.ExternalFunction(
 MONOTONIC, THREAD_CPUTIME, ABSOLUTE = 1, 3, 1
 I8: Final = np.dtype(np.int64)
 
-# rows of the table of places
-EXCHANGE: Final = 0
-COMMAND: Final = EXCHANGE + len(ARRAYS)
-LAW: Final = COMMAND + len(ARRAYS)
-TICKS_IN: Final = LAW + len(PLACED)
-FRAMES_IN: Final = TICKS_IN + 3
-WORDS: Final = FRAMES_IN + 3
-PLAN, TICK_AT, MARKS, ROWS = range(WORDS + 1, WORDS + 5)
+EXCHANGE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, ROWS = range(11)
+"""Rows of the table: places of the kernels' own tables of places, then of arrays."""
 PERIOD_NS, TIMEOUT_NS, SYNC_BYTES = range(3)
 
 
@@ -91,20 +83,20 @@ def whole_tick(
     timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes])
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks = np.zeros(0, np.int64) if marks is None else marks
-    rows = [(shared, I8), (timing, I8), (recorder.record, TICK), (marks, I8)]
-    own = np.array([place_of(*row) for row in rows])
-    records, frames = recorder.places(ports.log)
-    table = np.concatenate([ports.exchange, ports.command, machine.places(), records, frames, own])
-    call = partial(_compiled(), table)
-    call.__dict__["alive"] = (ports, machine, recorder, rows)  # the places are of their arrays
+    tables = [ports.exchange, ports.command, machine.places(), *recorder.places(ports.log)]
+    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks]
+    rows = [place_of(table.reshape(-1), I8) for table in tables]
+    rows += [place_of(array, TICK if array is recorder.record else I8) for array in arrays]
+    call = partial(_compiled(), np.array(rows))
+    call.__dict__["alive"] = (client, machine, recorder, tables, arrays)  # the places are of them
     return call
 
 
 def _compiled() -> Callable[..., int]:
     """The compiled form; the call that makes it is for a tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    known = [(PLAN, np.zeros(3, np.int64)), (MARKS, np.zeros(0, np.int64)), (TIMES, np.zeros(4, np.int64))]
-    for row, array in known:
+    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(3, np.int64)}
+    for row, array in known.items():
         table[row] = place_of(array, I8)
     return entry(run_tick, table, 0, 0, 0, False)
 
@@ -169,8 +161,8 @@ def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_faile
 def read(table: Any, t: Any, deadline_ns: int) -> Any:
     """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
     words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
-    places = table[EXCHANGE:COMMAND]
-    times, io = array_at(places, TIMES, I8), array_at(places, IO, I8)
+    places, times = places_at(table, EXCHANGE), array_at(table, TIMES_AT, I8)
+    io = array_at(places, IO, I8)
     if len(words) > 0:
         words[BEAT_NS] = now_ns(times)
         if words[FIRED] != 0:
@@ -189,8 +181,8 @@ def read(table: Any, t: Any, deadline_ns: int) -> Any:
 @jit
 def answer(table: Any, t: Any) -> Any:
     """The command, if there is one. Returns the stage reached: SENT when the loop has nothing to send."""
-    words, places = array_at(table, WORDS, I8), table[COMMAND:LAW]
-    times, io = array_at(places, TIMES, I8), array_at(places, IO, I8)
+    words, places = array_at(table, WORDS, I8), places_at(table, COMMAND)
+    times, io = array_at(table, TIMES_AT, I8), array_at(places, IO, I8)
     if t["send"] == 0:
         return SENT
     if len(words) > 0:
@@ -208,16 +200,16 @@ def answer(table: Any, t: Any) -> Any:
 @jit
 def hand_on(table: Any) -> None:
     """Frames into their ring, some ticks' together."""
-    state = array_at(table[EXCHANGE:COMMAND], STATES, STATE)
+    state = array_at(places_at(table, EXCHANGE), STATES, STATE)
     if state[0]["logged"] >= FLUSH_AT:
-        push(table[FRAMES_IN:WORDS], state[0]["logged"])
+        push(places_at(table, FRAMES_IN), state[0]["logged"])
         state[0]["logged"] = 0
 
 
 @waiting
 def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
     """A tick at its deadline [ns]; returns the stage of :mod:`hil.loop` that it reached."""
-    times, marks = array_at(table, TIMES, I8), array_at(table, MARKS, I8)
+    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
     mark(marks, LOOP, times)
     woken_ns = sleep_until(deadline_ns, times)
     mark(marks, SLEEP, times)
@@ -233,7 +225,7 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
         return stage
     t["received_ns"] = since(deadline_ns, times)
     state = t["state"]
-    whole_at(table[LAW:TICKS_IN], ticks)
+    whole_at(places_at(table, LAW), ticks)
     t["computed_ns"] = since(deadline_ns, times)
     mark(marks, CONTROL, times)
     stage = answer(table, t)
@@ -244,7 +236,7 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
     hand_on(table)
     if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state:
         return SENT
-    push(table[TICKS_IN:FRAMES_IN], 1)
+    push(places_at(table, TICKS_IN), 1)
     t["recorded_ns"] = since(deadline_ns, times)
     mark(marks, RECORD, times)
     return RECORDED

@@ -73,16 +73,13 @@ class Forked:
 
 def warm_up() -> None:
     """Import what a run needs and load its compiled kernels once, before any process is forked."""
-    from drivers.client import precompile
-    from hil.app import Overrides, load_setup
-    from hil.signals import new_ticks
+    from hil.app import Overrides, compile_kernels, load_setup
 
     setup = load_setup(Path(CONFIG), Overrides())
     node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
     node[0].warm_up()
     node[1].close()
-    precompile(setup.database, setup.binding.map, False, new_ticks()[0])
-    setup.machine.looped()
+    compile_kernels(setup)
     read_in()
 
 
