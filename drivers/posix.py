@@ -159,13 +159,13 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
     state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
-    s = state[0]
-    if s["pending"] != 0 or s["down"] != 0:
+    s, io = state[0], array_at(places, IO, I8)
+    if s["pending"] != 0 or s["down"] != 0 or io[LATE] != 0:
         return PENDING
     s["got"] = 0
     code = drain(places, 0, True)
     if code != DONE:
-        array_at(places, IO, I8)[LATE] = code
+        io[LATE] = code
         return PENDING
     s["got"] = 0
     s["syncs"] = s["syncs"] % SYNC_COUNTS + 1
