@@ -21,7 +21,7 @@ PATIENT_S = 240.0  # it is a big program
 LEGEND, MARKER = 128, 20  # height of title and legend, and pixels of a curve below them
 COLOUR = 0.15  # largest less smallest of red, green, blue: curves that lie on each other still have it
 OWN = "useMessageReducer addMessages() is changing frequently"
-"""What the app tells its own developers when a busy host lets it render slowly; it is not about the layout."""
+"""What the app tells its own developers on a busy host; it is not about the layout."""
 SAYS = "(document.body?.innerText ?? '').includes"
 
 
