@@ -9,7 +9,16 @@ from typing import Any
 
 import pytest
 
-from hil.guardian import GUARDIAN_LOST_NS, STOPS, GuardedDrive, Judge, Word, Words, watch
+from hil.guardian import (
+    GUARDIAN_LOST_NS,
+    STOPS,
+    GuardedDrive,
+    Judge,
+    Word,
+    Words,
+    guardian_flags,
+    watch,
+)
 from hil.signals import DriveState, RxFlag, new_ticks
 
 TIMEOUT = 50_000_000
@@ -248,6 +257,7 @@ def test_what_the_guardian_did_is_flagged(fired: int, age: int, flags: int) -> N
     g.tick["rx_flags"] = FRESH
     g.drive.receive(g.tick, 0)
     assert int(g.tick["rx_flags"]) == flags
+    assert guardian_flags(g.cells) == flags & ~FRESH
 
 
 @pytest.mark.parametrize(
