@@ -161,12 +161,12 @@ class Loop:
 
     def _run(self) -> None:
         outcome, period_ns, recorder = self._outcome, self._plan.period_ns, self._recorder
-        tick, whole = self._tick, self._whole
+        tick, whole, compiled = self._tick, self._whole, self._whole is not none_compiled
         start_ns = self._clock.now_ns()
         k = 0
         while True:
             deadline_ns = start_ns + k * period_ns
-            stage = whole(k, deadline_ns, self._asked(k), recorder.failed)
+            stage = whole(k, deadline_ns, self._asked(k), recorder.failed) if compiled else NOT_BEGUN
             if stage != RECORDED:
                 k = self._rest(stage, tick, k, deadline_ns)
             outcome.ticks += 1
