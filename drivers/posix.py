@@ -68,10 +68,16 @@ def errno() -> Any:
 
 
 @jit
-def now_ns(times: Any) -> Any:
-    """CLOCK_MONOTONIC [ns]. ``times``: int64 scratch of four, a timespec to read and one to wait."""
-    _clock_gettime(MONOTONIC, times.ctypes.data)
+def clock_ns(clock: int, times: Any) -> Any:
+    """A clock of the system [ns]. ``times``: int64 scratch of four, a timespec to read and one to wait."""
+    _clock_gettime(clock, times.ctypes.data)
     return times[0] * 1_000_000_000 + times[1]
+
+
+@jit
+def now_ns(times: Any) -> Any:
+    """CLOCK_MONOTONIC [ns], with the scratch of :func:`clock_ns`."""
+    return clock_ns(MONOTONIC, times)
 
 
 @jit

@@ -26,8 +26,10 @@ from drivers.posix import (
     EINTR,
     EXCHANGED,
     IO,
+    MONOTONIC,
     PENDING,
     STATES,
+    clock_ns,
     command,
     exchange,
     now_ns,
@@ -53,11 +55,10 @@ Marks = npt.NDArray[np.int64]
 """Each phase's processor time [ns], added up, and :data:`LAST`."""
 
 _types: Any = numba.types
-_clock_gettime = _types.ExternalFunction("clock_gettime", _types.int32(_types.int32, _types.uintp))
 _clock_nanosleep = _types.ExternalFunction(
     "clock_nanosleep", _types.int32(_types.int32, _types.int32, _types.uintp, _types.uintp)
 )
-MONOTONIC, THREAD_CPUTIME, ABSOLUTE = 1, 3, 1
+THREAD_CPUTIME, ABSOLUTE = 3, 1
 I8: Final = np.dtype(np.int64)
 
 EXCHANGE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, ROWS = range(11)
@@ -78,7 +79,7 @@ def whole_tick(
     The client must be prepared for the recorder's record, and for no other later.
     """
     ports = client.compiled()
-    if not COMPILED or ports is None or plan.pacing != "sync":
+    if ports is None or plan.pacing != "sync":
         return none_compiled
     timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes])
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
@@ -116,8 +117,7 @@ def load() -> None:
 def mark(marks: Any, phase: int, times: Any) -> None:
     """Add what the thread took since the last border to a phase."""
     if len(marks) > 0:
-        _clock_gettime(THREAD_CPUTIME, times.ctypes.data)
-        ns = times[0] * 1_000_000_000 + times[1]
+        ns = clock_ns(THREAD_CPUTIME, times)
         marks[phase] += ns - marks[LAST]
         marks[LAST] = ns
 
