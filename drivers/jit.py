@@ -1,11 +1,13 @@
-"""How kernels of the wire and of the emulator are compiled; neither imports the controller."""
+"""The one way that kernels are compiled: for a generic processor, exact IEEE arithmetic, cached on disk.
+
+No fastmath and no processor features, so that a result is the same to the bit on every machine of an
+architecture and with the compiler switched off (``NUMBA_DISABLE_JIT=1``). Control and emulator re-export this
+module; it knows neither.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -16,6 +18,8 @@ from numba.core import cgutils
 from numba.core import config as numba_config
 from numba.extending import intrinsic
 
+from drivers.kernelcache import KernelCache
+
 config: Any = numba_config  # its attributes are made at run time
 numba_types: Any = types
 carray: Any = numba.carray  # type: ignore[attr-defined]
@@ -24,34 +28,24 @@ COMPILED = not config.DISABLE_JIT
 config.CPU_NAME = "generic"
 config.CPU_FEATURES = ""
 
-
-def cache_folder(root: Path) -> Path:
-    """Folder of compiled kernels for exactly this source.
-
-    numba looks at the file of a function, not at those of the functions that it calls; a digest of all
-    sources keeps it from running an old callee inside a new caller.
-    """
-    digest = hashlib.sha256()
-    for package in ("hil", "drivers", "firmware_model"):
-        for path in sorted((root / package).rglob("*.py")):
-            digest.update(path.read_bytes())
-    base = Path(os.environ.get("NUMBA_CACHE_DIR") or root / ".cache" / "numba")
-    return base / digest.hexdigest()[:16]
-
-
-config.CACHE_DIR = str(cache_folder(Path(__file__).resolve().parents[1]))
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def jit(function: Function) -> Function:
     """Compile with numba at the first call: exact IEEE arithmetic, generic processor, cached on disk."""
-    return cast(Function, numba.njit(cache=True, fastmath=False, error_model="numpy")(function))
+    return cast(Function, _cached(numba.njit(fastmath=False, error_model="numpy")(function)))
 
 
 def waiting(function: Function) -> Function:
     """:func:`jit` for a kernel that waits: other threads of Python's run meanwhile."""
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    return cast(Function, _cached(numba.njit(nogil=True, error_model="numpy")(function)))
+
+
+def _cached(dispatcher: Any) -> Any:
+    """The same with :mod:`drivers.kernelcache`; what is not compiled needs none."""
+    if COMPILED:
+        dispatcher._cache = KernelCache(dispatcher.py_func)
+    return dispatcher
 
 
 def entry(kernel: Function, *example: Any) -> Function:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.vm import image, machine
+from tests.vm import image
 
 NAME = "0123456789abcdef"
 
@@ -131,17 +131,6 @@ def test_the_way_to_a_file_goes_through_links(tmp_path: Path) -> None:
     inside = {str(path.relative_to(tmp_path)) for path in way if path.is_relative_to(tmp_path)}
     assert inside == {".", "venv", "versions", "versions/3", "versions/3/python", "versions/3/python3"}
     assert set(tmp_path.parents) <= way
-
-
-def test_compiled_kernels_of_old_sources_go(tmp_path: Path) -> None:
-    for number in range(machine.KEPT_KERNELS + 2):
-        folder = tmp_path / f"{number:016x}"
-        folder.mkdir()
-        os.utime(folder, (1e9 + number, 1e9 + number))
-    (tmp_path / "not-a-digest").mkdir()
-    machine._prune_kernels(tmp_path)
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"not-a-digest", *(f"{number:016x}" for number in range(2, machine.KEPT_KERNELS + 2))}
 
 
 SHOW = "import sys; print(__name__, sys.argv, sys.path[0]); sys.exit(3)"

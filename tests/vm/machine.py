@@ -13,7 +13,6 @@ import compileall
 import hashlib
 import json
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -44,7 +43,7 @@ MODULES = ("virtio_pci", "9pnet_virtio", "9p", "kvaser_pci", "can_raw", "can_bcm
 SIGN = "hil.bench_machine=1"
 FAST = "mitigations=off init_on_alloc=0 hardened_usercopy=off"
 TIMEOUT_S = 300.0
-KEPT_KERNELS = 8
+PACKAGES = ("hil", "drivers", "firmware_model")
 WAKE = b"\n" * 8  # a character that comes before the state is there is lost
 
 
@@ -172,7 +171,7 @@ def _job(command: Sequence[str]) -> str:
         "OPENBLAS_NUM_THREADS": "1",
     }
     setup = f"""\
-mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels()))} /dev/shm/numba
+mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels()))}/. /dev/shm/numba
 echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up
@@ -189,14 +188,14 @@ done
 
 def kernels() -> Path:
     """Folder of the kernels compiled for this tree."""
-    from drivers.jit import cache_folder as folder_of
+    from drivers.kernelcache import cache_folder as folder_of
 
-    return folder_of(ROOT)
+    return folder_of()
 
 
 def compile_sources() -> None:
     """Leave byte code beside the sources: the machine can not write it, and would compile in each run."""
-    for package in ("hil", "drivers", "firmware_model", "tests/vm"):
+    for package in (*PACKAGES, "tests/vm"):
         compileall.compile_dir(ROOT / package, quiet=2)
 
 
@@ -204,7 +203,8 @@ def warm_kernels() -> None:
     """Compile on the host what the machine will run, once for a tree: compiling there takes minutes."""
     folder = kernels()
     digest = hashlib.sha256(repr((sys.version, version("numba"))).encode())
-    for path in [HERE / "guest" / "process.py", *sorted((ROOT / "configs").rglob("*.*"))]:
+    sources = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+    for path in [HERE / "guest" / "process.py", *sorted((ROOT / "configs").rglob("*.*")), *sources]:
         digest.update(path.read_bytes())
     stamp = folder / f"warm-{digest.hexdigest()[:16]}"
     if stamp.exists():
@@ -214,7 +214,7 @@ def warm_kernels() -> None:
         demo = ("hil.cli", "demo", str(ROOT / "configs" / "demo.toml"), "--lockstep", "--json", *short)
         for module in (demo, ("tests.vm.guest.process",)):
             command = [sys.executable, "-m", *module]
-            environment = os.environ | {"NUMBA_CACHE_DIR": str(folder.parent)}
+            environment = os.environ | {"NUMBA_CACHE_DIR": str(folder)}
             done = subprocess.run(
                 command,
                 cwd=ROOT,
@@ -226,15 +226,9 @@ def warm_kernels() -> None:
             )
             if done.returncode != 0:
                 raise MachineError(f"{module[0]} does not run on the host: {done.stderr.strip()}")
+    for old in folder.glob("warm-*"):
+        old.unlink()
     stamp.touch()
-    _prune_kernels(folder.parent)
-
-
-def _prune_kernels(base: Path) -> None:
-    """Each change of a source leaves a folder of kernels: keep the newest."""
-    folders = [path for path in base.iterdir() if re.fullmatch("[0-9a-f]{16}", path.name)]
-    for old in sorted(folders, key=lambda path: path.stat().st_mtime, reverse=True)[KEPT_KERNELS:]:
-        shutil.rmtree(old, ignore_errors=True)
 
 
 def run_in_machine(

@@ -1,0 +1,124 @@
+"""Where compiled kernels are kept, and when they are out of date.
+
+numba's own cache looks at the file of a function, not at those of the functions that it calls: an old
+callee would live on inside a new caller. Here a kernel is as old as the sources that its module imports,
+directly or not, within this project: a change compiles what depends on it, and nothing else. A kernel has one
+set of files whatever line it stands on, so what is out of date is overwritten and nothing needs cleaning up.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from numba.core import caching
+
+numba_caching: Any = caching  # ships no types
+ROOT: Final = Path(__file__).resolve().parents[1]
+PACKAGES: Final = ("hil", "drivers", "firmware_model")
+_IMPORT: Final = re.compile(
+    rf"^[ \t]*(?:from|import)[ \t]+((?:{'|'.join(PACKAGES)})\b[\w.]*)"  # from a.b / import a.b
+    r"(?:[ \t]+import[ \t]+(\([^)]*\)|[^\n]*))?",
+    re.MULTILINE,
+)
+
+
+def cache_folder() -> Path:
+    """``NUMBA_CACHE_DIR``; else ``.cache/numba`` of the source tree; installed, the user's cache folder."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(given)
+    if (ROOT / "pyproject.toml").is_file():
+        return ROOT / ".cache" / "numba"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hil-drive" / "numba"
+
+
+@functools.cache
+def sources(path: Path) -> frozenset[Path]:
+    """The file and all files of this project that it imports, directly or not."""
+    found, left = {path}, [path]
+    while left:
+        new = _imported(left.pop()) - found
+        found |= new
+        left += new
+    return frozenset(found)
+
+
+@functools.cache
+def _imported(path: Path) -> frozenset[Path]:
+    """Files of this project that a file imports itself, those of the packages above them left out."""
+    text = path.read_text(encoding="utf-8")
+    names = {name for match in _IMPORT.finditer(text) for name in _modules(match[1], match[2] or "")}
+    return frozenset(file for name in names if (file := _file(name)) is not None)
+
+
+def _modules(module: str, names: str) -> list[str]:
+    """Modules that a statement may import: the one named, and each name in it."""
+    return [module, *(f"{module}.{name}" for name in re.findall(r"\w+", re.sub(r"#.*", "", names)))]
+
+
+def _file(module: str) -> Path | None:
+    path = ROOT.joinpath(*module.split("."))
+    candidates = (path.with_suffix(".py"), path / "__init__.py")
+    return next((file for file in candidates if file.is_file()), None)
+
+
+@functools.cache
+def _digest(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
+
+
+@functools.cache
+def stamp(path: Path) -> str:
+    """Digest of :func:`sources` of a file, with their names."""
+    total = hashlib.sha256()
+    for source in sorted(sources(path)):
+        name = source.relative_to(ROOT) if source.is_relative_to(ROOT) else source
+        total.update(str(name).encode() + b"\0" + _digest(source))
+    return total.hexdigest()
+
+
+class KernelLocator(numba_caching._CacheLocator):  # type: ignore[misc] # numba has no public way to set one
+    """A folder for each source file; the stamp is :func:`stamp`, the name that of the function alone."""
+
+    def __init__(self, py_file: str) -> None:
+        self._py_file = py_file
+        path = Path(py_file).resolve()
+        place = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path.relative_to("/")
+        self._stamp, self._path = stamp(path), cache_folder() / ".".join(place.with_suffix("").parts)
+
+    def get_cache_path(self) -> str:
+        """Folder of the kernels of this file."""
+        return str(self._path)
+
+    def get_source_stamp(self) -> str:
+        """What makes a kept kernel out of date when it changes."""
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        """Nothing: a module has each name once."""
+        return "kernel"
+
+    @classmethod
+    def from_function(cls, _function: Callable[..., Any], py_file: str) -> KernelLocator | None:
+        """The locator of a kernel; None where the folder can't be made, and numba looks for another."""
+        locator = cls(py_file)
+        try:
+            locator.ensure_cache_path()
+        except OSError:
+            return None
+        return locator
+
+
+class _Kernels(numba_caching.CompileResultCacheImpl):  # type: ignore[misc] # as above
+    _locator_classes = (KernelLocator, *numba_caching.CacheImpl._locator_classes)
+
+
+class KernelCache(numba_caching.FunctionCache):  # type: ignore[misc] # as above
+    """numba's cache of one function, with :class:`KernelLocator`."""
+
+    _impl_class = _Kernels
