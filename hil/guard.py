@@ -57,6 +57,12 @@ SAFETY_PARAMS: Final = np.dtype(
 )
 """Limits, times in ticks, and the resolution of the command on the wire. Units as in the config."""
 
+SAFETY_NEUTRAL: Final[dict[str, float]] = {}
+"""Parameters newer than log format 1, each with the value that means "as before it was there".
+
+A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
+"""
+
 SAFETY_STATE: Final = np.dtype(
     [
         ("state", "i8"),

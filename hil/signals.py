@@ -133,6 +133,8 @@ class Field:
     unit: str
     role: Role
     doc: str
+    absent: float | None = None
+    """Of an input newer than log format 1: what a log without it stands for (docs/log-format.md)."""
 
 
 FIELDS: Final[tuple[Field, ...]] = (

@@ -62,6 +62,12 @@ LAW_PARAMS: Final = np.dtype(
     align=True,
 )
 
+LAW_NEUTRAL: Final[dict[str, float]] = {}
+"""Parameters newer than log format 1, each with the value that means "as before it was there".
+
+A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
+"""
+
 LAW_STATE: Final = np.dtype(
     [
         ("x", "f8", 3),

@@ -35,6 +35,9 @@ REFERENCE: Final = np.dtype(
     align=True,
 )
 
+REFERENCE_NEUTRAL: Final[dict[str, float]] = {}
+"""Parameters newer than log format 1, each with the value that means "as before"; see the law's table."""
+
 Kind = Literal["step", "ramp", "s-curve", "sine", "table"]
 _KINDS: Final[dict[str, int]] = {"step": STEP, "ramp": RAMP, "s-curve": S_CURVE, "sine": SINE, "table": TABLE}
 
