@@ -17,7 +17,7 @@ from hil.app import Overrides
 from hil.bench.machine import machine_facts
 from hil.bench.measure import QUICK, Length, simulate_speed
 from hil.bench.processes import Stand, bare_run, hil_run, metered_run, stand
-from hil.demo import find_config
+from hil.shipped import find_config
 from hil.view import key_values, show
 
 HERE = Path(__file__).resolve().parent

@@ -21,7 +21,7 @@ from hil.bench.histogram import Histogram
 from hil.bench.machine import machine_facts
 from hil.bench.measure import phases
 from hil.bench.processes import LoopRun, hil_run, stand
-from hil.demo import find_config
+from hil.shipped import find_config
 from hil.view import key_values, show
 
 GROWTH_KIB = 512

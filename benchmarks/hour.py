@@ -25,10 +25,10 @@ import numpy as np
 from rich.table import Table
 
 from hil.convert.export import FORMATS
-from hil.demo import find_config
 from hil.log.mcapfile import RunFile
 from hil.log.reader import new_log, read_blocks
 from hil.log.schema import FRAME, Records
+from hil.shipped import find_config
 from hil.signals import TickArray
 from hil.view import show
 

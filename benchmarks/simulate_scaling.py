@@ -20,7 +20,7 @@ import numpy as np
 
 from hil.app import Overrides, load_setup
 from hil.bench.machine import machine_facts
-from hil.demo import find_config
+from hil.shipped import find_config
 from hil.simulate import make_simulation
 from hil.view import key_values, show
 

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from hil.app import Overrides
 from hil.bench.machine import machine_facts
 from hil.bench.processes import Stand, hil_run, stand
-from hil.demo import find_config
+from hil.shipped import find_config
 from hil.view import key_values, show
 
 COMMANDS: dict[str, tuple[str, ...]] = {

@@ -40,6 +40,7 @@ from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
 from hil.ports import Drive
 from hil.progress import say, watching
 from hil.shadow import ShadowDrive
+from hil.shipped import log_base
 from hil.showable import check_limits
 from hil.signals import Reason, new_ticks
 from hil.watch.registry import announced, own_entry, who_asked
@@ -233,7 +234,7 @@ def log_path(setup: Setup, kind: str) -> Path:
     log = setup.config.log
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     name = log.name or f"{setup.path.stem}-{kind}-{stamp}"
-    path = (setup.path.parent / log.folder / f"{name}.mcap").resolve()
+    path = (log_base(setup.path) / log.folder / f"{name}.mcap").resolve()
     return path if log.split_s is None and log.split_mb is None else part_path(path, 0)
 
 

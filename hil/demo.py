@@ -24,18 +24,10 @@ from hil.errors import HilError
 from hil.log.reader import Log, open_log
 from hil.metrics import Lateness, LoadStep, load_step, tracking_rms
 from hil.replay import Verdict, replay_log
+from hil.shipped import find_config
 from hil.signals import TickArray
 
-CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-__all__ = ["closed_loop", "demo", "emulator_process", "find_config", "resolution_bound"]
-
-
-def find_config(name: str) -> Path:
-    """A shipped configuration: in the working directory's configs/, else beside the package."""
-    for folder in (Path("configs"), CONFIGS):
-        if (folder / name).is_file():
-            return folder / name
-    raise HilError(f"configs/{name}: not found; run from the project's folder or pass a configuration")
+__all__ = ["closed_loop", "demo", "emulator_process", "resolution_bound"]
 
 
 @contextlib.contextmanager

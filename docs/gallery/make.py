@@ -27,7 +27,8 @@ from rich.console import Console, RenderableType  # noqa: E402 - the project's f
 from rich.text import Text  # noqa: E402
 
 from hil.app import Overrides  # noqa: E402
-from hil.demo import emulator_process, find_config  # noqa: E402
+from hil.demo import emulator_process  # noqa: E402
+from hil.shipped import find_config  # noqa: E402
 from hil.view import demo_table  # noqa: E402
 from hil.watch.look import Look  # noqa: E402
 from hil.watch.registry import WatchError, choose  # noqa: E402

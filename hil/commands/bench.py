@@ -32,7 +32,7 @@ def cmd_bench(args: argparse.Namespace) -> int:
     from hil.bench.measure import FULL, QUICK, bench
     from hil.bench.page import write
     from hil.bench.view import ratio_rows, ratios, read_result, rows
-    from hil.demo import find_config
+    from hil.shipped import find_config
     from hil.view import key_values, show
 
     earlier = read_result(args.compare) if args.compare else None

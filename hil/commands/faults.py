@@ -30,12 +30,12 @@ def cmd_faults(args: argparse.Namespace) -> int:
     """Run the matrix."""
     from datetime import UTC, datetime
 
-    from hil.demo import find_config
     from hil.faults.judge import AS_EXPECTED
     from hil.faults.matrix import chosen, load_matrix
     from hil.faults.page import page
     from hil.faults.study import study
     from hil.faults.view import closing, table
+    from hil.shipped import find_config
     from hil.view import show
 
     html = output_file(args.html) if args.html else None

@@ -21,8 +21,9 @@ def register(commands: Commands) -> None:
 def cmd_paper(args: argparse.Namespace) -> int:
     """Recompute the paper."""
     from hil.app import Overrides
-    from hil.demo import closed_loop, find_config
+    from hil.demo import closed_loop
     from hil.paper import run
+    from hil.shipped import find_config
     from hil.view import show
 
     out = output_folder(args.output)
