@@ -10,7 +10,7 @@ NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.2
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: gallery demo test lint unit interpreted vm clean help crash faults soak fuzz guided mutants node
+.PHONY: gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -29,6 +29,9 @@ lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+quick: $(STAMP) lint ## before each commit: lint, types, the fast tests
+	$(BIN)/python -m pytest -q -m "not process and not vm and not slow" tests/unit tests/property tests/closed_loop
 
 unit: $(STAMP) ## all tests, compiled
 	$(BIN)/python -m pytest
