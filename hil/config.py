@@ -13,19 +13,24 @@ import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, Union
 
 from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
+    Tag,
+    TypeAdapter,
     ValidationError,
     ValidationInfo,
+    create_model,
     field_validator,
     model_validator,
 )
 
+from hil.control.registry import REQUIRED, Key, laws, observers
 from hil.errors import ConfigError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -162,19 +167,59 @@ class DriveTable(Table):
     """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""
 
 
-class ChannelTable(Table):
-    """One channel's window: FTDOB with two poles and a delay D, or a conventional DOB with one pole."""
+def _annotation(key: Key) -> tuple[Any, Any]:
+    """Type and default of a member's key, as pydantic takes them."""
+    if key.type == "flag":
+        return bool, key.default
+    bounds: Any = Field(gt=key.above, ge=key.least, le=key.most, allow_inf_nan=False)
+    kind: Any = Annotated[float, bounds]
+    if key.type == "numbers":
+        kind = Annotated[list[kind], Field(min_length=1, max_length=key.count)]
+    return (
+        (kind, ...)
+        if key.default is REQUIRED
+        else (kind | None if key.default is None else kind, key.default)
+    )
 
-    kind: Literal["ftdob", "dob"] = "ftdob"
-    gamma_1_rad_s: Positive
-    gamma_2_rad_s: Positive | None = None
-    delay_ms: Positive | None = None
 
-    @model_validator(mode="after")
-    def _complete(self) -> ChannelTable:
-        if self.kind == "ftdob" and (self.gamma_2_rad_s is None or self.delay_ms is None):
-            raise ValueError("an ftdob channel needs gamma_2_rad_s and delay_ms")
-        return self
+def _tables(members: Mapping[str, Any], suffix: str, common: dict[str, Any]) -> Any:
+    """The union of the tables of all members; ``kind`` tells them apart, the most usual may leave it out."""
+    made = []
+    for kind, member in members.items():
+        fields = {name: _annotation(key) for name, key in member.keys.items()} | common
+        name = "".join(part.title() for part in kind.split("-")) + suffix
+        tag: Any = (Literal[kind], kind)
+        table = create_model(name, __base__=Table, __doc__=member.doc, kind=tag, **fields)
+        made.append(Annotated[table, Tag(kind)])
+    names = ", ".join(repr(kind) for kind in members)
+    return Annotated[
+        Union[tuple(made)],  # noqa: UP007 - made at run time
+        Discriminator(
+            _observer_kind if suffix == "Observer" else _law_kind,
+            custom_error_type="unknown_kind",
+            custom_error_message=f"kind must be one of {names}",
+        ),
+    ]
+
+
+def _observer_kind(value: Any) -> Any:
+    """The kind that an observer's table names; the paper's when it names none."""
+    return value.get("kind", "ftdob") if isinstance(value, Mapping) else getattr(value, "kind", None)
+
+
+def _law_kind(value: Any) -> Any:
+    """The kind that a law's table names; the cascade when it names none."""
+    return value.get("kind", "cascade") if isinstance(value, Mapping) else getattr(value, "kind", None)
+
+
+if typing.TYPE_CHECKING:
+    ChannelTable = Any
+    ControllerTable = Any
+else:
+    ChannelTable = _tables(observers(), "Observer", {})
+    """One channel's observer: a table of each registered kind (:mod:`hil.control.observers`)."""
+    ControllerTable = _tables(laws(), "Controller", {"compensate_coupling": (bool, True)})
+    """The control law: a table of each registered kind (:mod:`hil.control.laws`)."""
 
 
 class ObserverTable(Table):
@@ -182,16 +227,6 @@ class ObserverTable(Table):
 
     speed: ChannelTable
     current: ChannelTable
-
-
-class ControllerTable(Table):
-    """Poles of the composite law; gains are derived from them (Theorem 2)."""
-
-    kind: Literal["cascade", "fac"] = "cascade"
-    speed_pole_rad_s: Positive = 30.0
-    current_pole_rad_s: Positive = 250.0
-    current_d_pole_rad_s: Positive | None = None
-    compensate_coupling: bool = True
 
 
 class LimitsTable(Table):
@@ -341,6 +376,12 @@ class EmulatorTable(Table):
     plant: str
 
 
+def _cascade() -> Any:
+    """The controller of a config that names none."""
+    adapter: Any = TypeAdapter(ControllerTable)
+    return adapter.validate_python({"kind": "cascade"})
+
+
 class RunConfig(Table):
     """Everything a run needs."""
 
@@ -350,7 +391,7 @@ class RunConfig(Table):
     bus: BusTable = BusTable()
     drive: DriveTable
     motor: Annotated[MotorTable, BeforeValidator(included)]
-    controller: ControllerTable = ControllerTable()
+    controller: ControllerTable = Field(default_factory=_cascade)
     observer: ObserverTable
     limits: LimitsTable
     feedback: FeedbackTable = FeedbackTable()
@@ -404,7 +445,7 @@ def _apply_override(data: dict[str, Any], override: str, base: Path) -> None:
 
 def _describe(problem: Any, model: type[BaseModel]) -> str:
     """One line for one pydantic problem: key path, what is wrong, what to do."""
-    path = ".".join(str(part) for part in problem["loc"])
+    path = ".".join(_written(problem["loc"]))
     if problem["type"] == "extra_forbidden":
         near = difflib.get_close_matches(str(problem["loc"][-1]), _keys_at(model, problem["loc"][:-1]), n=1)
         return f"{path}: unknown key" + (f"; did you mean {near[0]!r}?" if near else "; remove it")
@@ -414,6 +455,13 @@ def _describe(problem: Any, model: type[BaseModel]) -> str:
     text = text[:1].lower() + text[1:]
     given = problem.get("input")
     return f"{path}: {text}" + (f", not {given!r}" if isinstance(given, (int, float, str)) else "")
+
+
+def _written(loc: tuple[Any, ...]) -> list[str]:
+    """The key path as the file has it: pydantic names the kind of a law or an observer after its table."""
+    kinds: dict[Any, Any] = {"controller": laws(), "speed": observers(), "current": observers()}
+    before = ("", *loc[:-1])
+    return [str(part) for table, part in zip(before, loc, strict=True) if part not in kinds.get(table, ())]
 
 
 def _keys_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:

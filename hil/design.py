@@ -7,11 +7,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hil.config import ChannelTable, LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.config import LimitsTable, MotorTable, ReferenceTable, RunConfig
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
@@ -118,25 +119,24 @@ def motor_model(table: MotorTable) -> MotorModel:
     )
 
 
-def _channel(table: ChannelTable) -> ChannelSpec:
-    delay_s = (table.delay_ms or 0.0) * 1e-3
-    return ChannelSpec(table.kind, table.gamma_1_rad_s, table.gamma_2_rad_s or 0.0, delay_s)
+def _values(table: Any) -> dict[str, Any]:
+    """The keys of a law's or an observer's table, without what every one has."""
+    keys: dict[str, Any] = table.model_dump(exclude={"kind", "compensate_coupling"})
+    return keys
 
 
 def law_spec(config: RunConfig) -> LawSpec:
     """The law's tuning. Raises ControlDesignError only when designed."""
-    controller = config.controller
+    controller, observer = config.controller, config.observer
     return LawSpec(
         kind=controller.kind,
         motor=motor_model(config.motor),
-        speed=_channel(config.observer.speed),
-        current=_channel(config.observer.current),
-        speed_pole=controller.speed_pole_rad_s,
-        current_pole=controller.current_pole_rad_s,
-        current_d_pole=controller.current_d_pole_rad_s or controller.current_pole_rad_s,
+        speed=ChannelSpec(observer.speed.kind, more=_values(observer.speed)),
+        current=ChannelSpec(observer.current.kind, more=_values(observer.current)),
         i_max=config.limits.i_max_a,
         T_L_max=config.limits.T_L_max_n_m,
         coupling=controller.compensate_coupling,
+        more=_values(controller),
     )
 
 

@@ -1,4 +1,4 @@
-"""The drive laws `cascade` and `fac` out of the same parts, as kernels over two fixed-shape records.
+"""The kernels of the drive laws, out of the same parts, over two fixed-shape records.
 
 State x = (w, i_q, i_d), input ua = (T_L, u_q, u_d) with B = diag(-1/J, 1/L_q, 1/L_d), one observer on the
 joint state. A tick is :func:`observe` (advance the estimate by what was applied), :func:`command` (compute
@@ -10,25 +10,29 @@ Known nonlinear terms, added to the linear model through Ed:
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass
-from typing import Any, Final, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from hil.control.composite import composite_gain, predict
+from hil.control.composite import predict
 from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
 from hil.control.jit import jit
 from hil.control.linalg import Array, copy, matvec, matvec_add
-from hil.control.observer import Window, conventional_dob, fill, ftdob, side_by_side, window_step
+from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
+from hil.control.registry import Channel, Plan, laws, member, observers
 
 N_MAX: Final = 1024
 """Longest window D [ticks] that the record has room for."""
 
 CASCADE: Final = 0
 FAC: Final = 1
+PI: Final = 2
 
 LAW_PARAMS: Final = np.dtype(
     [
@@ -58,11 +62,26 @@ LAW_PARAMS: Final = np.dtype(
         ("lam_d", "f8"),
         ("i_max", "f8"),
         ("T_L_max", "f8"),
+        ("shaped", "i8"),
+        ("form", "i8", 3),
+        ("third", "f8", (3, 3)),
+        ("g", "f8", (FIR_MAX, 3)),
+        ("M", "f8", (3, 3)),
+        ("W", "f8", (3, 3)),
+        ("filtered", "i8"),
+        ("S", "f8", (3, 3)),
+        ("k_p", "f8", 3),
+        ("k_i", "f8", 3),
     ],
     align=True,
 )
+"""Parameters, from ``shaped`` on neutral at zero: observers of other forms than the pair of exponentials
+(:class:`hil.control.observer.Window`), 1 in ``shaped`` when a channel has one, 1 in ``filtered`` when the law
+takes x_hat; gains of the PI law (w, q, d)."""
 
-LAW_NEUTRAL: Final[dict[str, float]] = {}
+LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
+    ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i"), 0.0
+)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -87,9 +106,17 @@ LAW_STATE: Final = np.dtype(
         ("work", "f8", 3),
         ("u", "f8", 3),
         ("i_q_ref", "f8"),
+        ("h_3", "f8", 3),
+        ("past_3", "f8", (N_MAX, 3)),
+        ("rho", "f8", 3),
+        ("d_filter", "f8", 3),
+        ("x_hat", "f8", 3),
+        ("I", "f8", 3),
     ],
     align=True,
 )
+"""State; from ``h_3`` on of :func:`shape_step` (third exponential, filter) and the PI law's integrators ``I``
+[A, V, V]."""
 
 Record = npt.NDArray[np.void]
 
@@ -128,36 +155,50 @@ class MotorModel:
 
 @dataclass(frozen=True, slots=True)
 class ChannelSpec:
-    """One channel's window: FTDOB (gamma_1, gamma_2 [rad/s], D [s]) or conventional DOB (gamma_1)."""
+    """One channel's window: FTDOB (gamma_1, gamma_2 [rad/s], D [s]), conventional DOB (gamma_1), or another.
 
-    kind: Literal["ftdob", "dob"]
-    gamma_1: float
+    ``more`` are the keys of the other kinds, as their tables have them.
+    """
+
+    kind: str
+    gamma_1: float = 0.0
     gamma_2: float = 0.0
     delay: float = 0.0
+    more: Mapping[str, Any] = field(default_factory=dict)
 
-    def window(self, T_s: float) -> Window:
-        """Design the window; raises ControlDesignError."""
-        if self.kind == "dob":
-            return conventional_dob(np.array([self.gamma_1]), T_s)
-        return ftdob(np.array([self.gamma_1]), np.array([self.gamma_2]), self.delay, T_s)
+    def values(self) -> dict[str, Any]:
+        """What the registered design takes."""
+        own = {"gamma_1_rad_s": self.gamma_1, "gamma_2_rad_s": self.gamma_2, "delay_ms": self.delay * 1e3}
+        return dict(self.more) if self.more else own
 
 
 @dataclass(frozen=True, slots=True)
 class LawSpec:
-    """Tuning of a drive law: poles [rad/s], windows, limits. Gains are derived, never given."""
+    """Tuning of a drive law: poles [rad/s], windows, limits. Gains are derived, never given.
 
-    kind: Literal["cascade", "fac"]
+    ``more`` are the keys of other laws than cascade and fac, as their tables have them.
+    """
+
+    kind: str
     motor: MotorModel
     speed: ChannelSpec
     current: ChannelSpec
-    speed_pole: float
-    current_pole: float
-    current_d_pole: float
-    i_max: float
+    speed_pole: float = 30.0
+    current_pole: float = 250.0
+    current_d_pole: float = 250.0
+    i_max: float = 0.0
     T_L_max: float = 0.0
     coupling: bool = True
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    def values(self) -> dict[str, Any]:
+        """What the registered design takes."""
+        poles = (self.speed_pole, self.current_pole, self.current_d_pole)
+        names = ("speed_pole_rad_s", "current_pole_rad_s", "current_d_pole_rad_s")
+        return dict(self.more) if self.more else dict(zip(names, poles, strict=True))
 
 
+@functools.lru_cache(64)
 def sampled_model(motor: MotorModel, T_s: float) -> SampledModel:
     """Exact sampled form of the joint linear model."""
     return sample(motor.A(), motor.B(), T_s)
@@ -165,11 +206,32 @@ def sampled_model(motor: MotorModel, T_s: float) -> SampledModel:
 
 def law_window(spec: LawSpec, T_s: float) -> Window:
     """The joint window of the channels (w, q, d). Raises ControlDesignError, also for D over N_MAX ticks."""
-    window = side_by_side(spec.speed.window(T_s), spec.current.window(T_s), spec.current.window(T_s))
+    window = _window(spec, T_s)
     if window.N.max() >= N_MAX:
         raise ControlDesignError(
             f"D = {window.N.max()} ticks is longer than the {N_MAX - 1} kept; shorten D or lower the rate"
         )
+    return window
+
+
+def _window(spec: LawSpec, T_s: float) -> Window:
+    """Channel by channel, or all at once by an observer that needs them so."""
+    own = [member(channel.kind, observers()) for channel in (spec.speed, spec.current)]
+    if any(observer.joint for observer in own):
+        if own[0] is not own[1]:
+            joint = next(observer.kind for observer in own if observer.joint)
+            raise ControlDesignError(f"observer kind {joint} is one for all channels: give it to both")
+        whole: Window = own[0].joint(
+            spec.speed.values(), spec.current.values(), sampled_model(spec.motor, T_s)
+        )
+        return whole
+    rows = ((own[0], spec.speed), (own[1], spec.current), (own[1], spec.current))
+    return side_by_side(*(_channel(o, c, i, spec.motor, T_s) for i, (o, c) in enumerate(rows)))
+
+
+def _channel(observer: Any, given: ChannelSpec, index: int, motor: MotorModel, T_s: float) -> Window:
+    """The window of one channel."""
+    window: Window = observer.design(given.values(), Channel(index, T_s, sampled_model(motor, T_s)))
     return window
 
 
@@ -186,14 +248,12 @@ def _check(spec: LawSpec) -> None:
 def design_law(spec: LawSpec, T_s: float) -> Record:
     """Design a law: a one-element array of LAW_PARAMS. Raises ControlDesignError."""
     _check(spec)
-    motor = spec.motor
-    model, window = sampled_model(motor, T_s), law_window(spec, T_s)
-    poles = (spec.speed_pole, spec.current_pole, spec.current_d_pole)
-    gain = composite_gain(model, -np.diag(poles), np.eye(3))
+    motor, law = spec.motor, member(spec.kind, laws())
+    window, model = law_window(spec, T_s), sampled_model(spec.motor, T_s)
     speed = sample(np.array([[-motor.B_f / motor.J]]), np.array([[motor.k_t / motor.J]]), T_s, 1)
     params = np.zeros(1, LAW_PARAMS)
     values = {
-        "kind": FAC if spec.kind == "fac" else CASCADE,
+        "kind": law.code,
         "coupling": int(spec.coupling),
         "Ad": model.Ad,
         "Bd": model.Bd,
@@ -203,8 +263,6 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "lam_N": window.lam_N,
         "theta": window.theta,
         "N": window.N,
-        "closed": gain.closed,
-        "Bd_inv": gain.Bd_inv,
         "T_s": T_s,
         "J": motor.J,
         "k_t": motor.k_t,
@@ -213,14 +271,15 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "L_q": motor.L_q,
         "a_w": speed.Ad[0, 0],
         "e_w": speed.Ed[0, 0],
-        "lam_w": math.exp(-spec.speed_pole * T_s),
-        "lam_q": math.exp(-spec.current_pole * T_s),
-        "lam_d": math.exp(-spec.current_d_pole * T_s),
         "i_max": spec.i_max,
         "T_L_max": spec.T_L_max,
     }
-    for name, value in values.items():
+    for name, value in (values | law.design(spec.values(), Plan(motor, model, T_s))).items():
         params[name] = value
+    for name in ("form", "third", "g", "M", "W", "S"):
+        if (part := getattr(window, name)).size:
+            params[name] = part
+    params["shaped"], params["filtered"] = params["form"].any(), params["S"].any()
     params["gap_inverse"][0, : len(model.gap_inverse)] = model.gap_inverse
     return params
 
@@ -247,6 +306,8 @@ def reset(s: Any) -> None:
     s["gap"] = 0
     for c in range(3):
         s["d_hat"][c] = 0.0
+        s["rho"][c] = 0.0
+        s["I"][c] = 0.0
 
 
 @jit
@@ -301,10 +362,14 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     innovate(p, s)
     if s["filled"] == 0:
         fill(s["v"], s["h"], s["past"])
+        if p["shaped"]:
+            shape_fill(s)
     for _ in range(s["gap"]):
         s["head"] = window_step(
             p["lam"], p["lam_N"], p["theta"], p["N"], s["v"], s["h"], s["past"], s["head"], s["d_hat"]
         )
+        if p["shaped"]:
+            shape_step(p, s)
     s["filled"] = min(s["filled"] + s["gap"], max(p["N"][0], p["N"][1], p["N"][2]))
     start(p, s)
 
@@ -316,11 +381,22 @@ def apply(s: Any, T_L: float, u_q: float, u_d: float) -> None:
 
 
 @jit
+def filtered_state(p: Any, s: Any) -> None:
+    """x_hat = x - S rho, the filter's own state; the measured one where the law takes that."""
+    copy(s["x"], s["x_hat"])
+    if p["filtered"]:
+        matvec(p["S"], s["rho"], s["work"])
+        for c in range(3):
+            s["x_hat"][c] -= s["work"][c]
+
+
+@jit
 def look_ahead(p: Any, s: Any) -> None:
     """x_p: the state one tick on under the input that acts now; d_p = d_hat + c(x_p)."""
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["c"][c]
-    predict(p["Ad"], p["Bd"], p["Ed"], s["x"], s["ua"], s["d_p"], s["x_p"])
+    filtered_state(p, s)
+    predict(p["Ad"], p["Bd"], p["Ed"], s["x_hat"], s["ua"], s["d_p"], s["x_p"])
     known_terms(p, s["x_p"], s["work"])
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
@@ -378,6 +454,26 @@ def fac_law(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float) -> None
 
 
 @jit
+def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
+    """PI cascade on the measured state (:mod:`hil.control.laws.pi`); what is cut off is not integrated."""
+    x, k_p, k_i, total = s["x"], p["k_p"], p["k_i"], s["I"]
+    e_w = w_ref - x[0]
+    asked = k_p[0] * e_w + total[0] + p["J"] * dw_ref / p["k_t"]
+    i_q_ref = min(max(asked, -p["i_max"]), p["i_max"])
+    total[0] += p["T_s"] * k_i[0] * (e_w + (i_q_ref - asked) / k_p[0])
+    s["i_q_ref"] = i_q_ref
+    psi_f = p["k_t"] / (1.5 * p["n_p"])
+    u = s["u"]
+    u[0] = 0.0
+    u[1] = k_p[1] * (i_q_ref - x[1]) + total[1] + p["n_p"] * x[0] * (psi_f + p["L_d"] * x[2])
+    u[2] = -k_p[2] * x[2] + total[2] - p["n_p"] * x[0] * p["L_q"] * x[1]
+    u_q, u_d = u[1], u[2]
+    to_circle(s, u_limit)
+    total[1] += p["T_s"] * k_i[1] * (i_q_ref - x[1] + (u[1] - u_q) / k_p[1])
+    total[2] += p["T_s"] * k_i[2] * (-x[2] + (u[2] - u_d) / k_p[2])
+
+
+@jit
 def to_circle(s: Any, u_limit: float) -> None:
     """Limit (u_q, u_d) to the voltage circle, u_d first: it keeps the field, u_q gets what is left."""
     s["u"][2] = min(max(s["u"][2], -u_limit), u_limit)
@@ -394,6 +490,8 @@ def command(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit
     look_ahead(p, s)
     if p["kind"] == FAC:
         fac_law(p, s, w_ref, dw_ref, i_q_ref)
+    elif p["kind"] == PI:
+        pi_law(p, s, w_ref, dw_ref, u_limit)
     else:
         s["i_q_ref"] = speed_law(p, s, w_ref, dw_ref)
         current_law(p, s)

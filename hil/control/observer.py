@@ -2,16 +2,18 @@
 
 Both share the innovation v_k = Ed^-1 (x_k - Ad x_{k-1} - Bd ua_{k-1}), which equals d_{k-1} exactly, and
 differ in the window that they put over it. The small interface of a window: a design that yields
-:class:`Window` (what every window has: two poles per channel, a length N, weights Theta), one step kernel,
-and :func:`impulse_response` for its bounds. A conventional DOB is the window with one pole, Theta = (1, 0)
-and no delayed term, so both run through one kernel.
+:class:`Window`, its step kernels, and :func:`impulse_response` for its bounds. A conventional DOB is the
+window with one pole, Theta = (1, 0) and no delayed term, so both run through one kernel. Three more forms
+take its place in their channels: a third exponential, weights over past innovations, a linear filter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Final
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
@@ -24,18 +26,38 @@ MAX_RESPONSE = 1 << 20
 """Longest impulse response that is summed for a bound [ticks]."""
 
 
+FIR_MAX: Final = 256
+"""Longest finite impulse response [ticks] that the record has room for."""
+
+PAIR, THIRD, FIR, FILTER = range(4)
+"""Forms of a channel: two exponentials (also the DOB), three, weights over the past innovations, a filter."""
+
+
+def _none() -> Array:
+    return np.zeros(0)
+
+
 @dataclass(frozen=True, slots=True)
 class Window:
     """Weights of a window, one entry (or pair) per channel; n channels.
 
     ``lam`` (2, n): lam_i = e^{-gamma_i T_s}; ``lam_N`` (2, n): lam_i^N, 0 for a filter without a window;
     ``theta`` (2, n); ``N`` (n,) window length in ticks (for a conventional DOB: 1).
+    Empty where no channel needs them: ``form`` (n,), one of PAIR, THIRD, FIR, FILTER; ``third`` (3, n): lam,
+    lam^N and Theta of a third exponential; ``g`` (FIR_MAX, n): d_hat_k = sum_j g_j v_{k-j}; ``M``, ``W``,
+    ``S`` (n, n): rho_k = M rho_{k-1} + v_k - d_hat_{k-1}, d_hat_k = d_hat_{k-1} + W rho_k, x_hat = x - S rho.
     """
 
     lam: Array
     lam_N: Array
     theta: Array
     N: Index
+    form: Array = field(default_factory=_none)
+    third: Array = field(default_factory=_none)
+    g: Array = field(default_factory=_none)
+    M: Array = field(default_factory=_none)
+    W: Array = field(default_factory=_none)
+    S: Array = field(default_factory=_none)
 
     @property
     def n(self) -> int:
@@ -109,14 +131,52 @@ def conventional_dob(gamma_c: Array, T_s: float) -> Window:
     )
 
 
+def exponentials(lam: Array, theta: Array, N: int) -> Window:
+    """One channel of one to three exponentials; lam, theta (k,)."""
+    lam, theta = (np.r_[a, np.zeros(3 - len(a))] for a in (lam, theta))
+    lam_N, length = np.where(theta != 0, lam**N, 0.0), np.array([N], np.int64)
+    first, first_N, weights = (np.reshape(a[:2], (2, 1)) for a in (lam, lam_N, theta))
+    if theta[2] == 0:
+        return Window(first, first_N, weights, length)
+    return Window(
+        first, first_N, weights, length, np.array([THIRD]), np.array([[lam[2]], [lam_N[2]], [theta[2]]])
+    )
+
+
+def fir(g: Array) -> Window:
+    """One channel that weighs the past N innovations; g (N,), N at most FIR_MAX.
+
+    Its pair has lam = 0: h = v, so that the pair's memory is that of v.
+    """
+    zero, padded = np.zeros((2, 1)), np.zeros((FIR_MAX, 1))
+    padded[: len(g), 0] = g
+    return Window(zero, zero, zero, np.array([len(g)], np.int64), np.array([FIR]), g=padded)
+
+
+def linear_filter(M: Array, W: Array, S: Array | None = None) -> Window:
+    """n channels of the filter rho_k = M rho_{k-1} + v_k - d_hat_{k-1}, d_hat_k = d_hat_{k-1} + W rho_k."""
+    n = len(M)
+    zero, one = np.zeros((2, n)), np.ones(n, np.int64)
+    return Window(zero, zero, zero, one, np.full(n, FILTER), M=M, W=W, S=_none() if S is None else S)
+
+
 def side_by_side(*windows: Window) -> Window:
     """One window whose channels are those of ``windows`` in turn."""
-    return Window(
-        np.concatenate([w.lam for w in windows], axis=1),
-        np.concatenate([w.lam_N for w in windows], axis=1),
-        np.concatenate([w.theta for w in windows], axis=1),
-        np.concatenate([w.N for w in windows]),
-    )
+    every = ("lam", "lam_N", "theta", "N")
+    own = {name: np.concatenate([getattr(w, name) for w in windows], axis=-1) for name in every}
+    if not any(len(w.form) for w in windows):
+        return Window(**own)
+    rows = {"form": (), "third": (3,), "g": (FIR_MAX,)}
+    for name, shape in rows.items():
+        own[name] = np.concatenate([_part(w, name, (*shape, w.n)) for w in windows], axis=-1)
+    square = {name: block_diag(*(_part(w, name, (w.n, w.n)) for w in windows)) for name in ("M", "W", "S")}
+    return Window(**own, **square)
+
+
+def _part(window: Window, name: str, shape: tuple[int, ...]) -> Array:
+    """A part that may be empty, as zeros then."""
+    part: Array = getattr(window, name)
+    return part if part.size else np.zeros(shape)
 
 
 @jit
@@ -162,11 +222,81 @@ def fill(v: Array, h: Array, past: Array) -> None:
                 past[j, i, c] = v[c]
 
 
+@jit
+def shape_step(p: Any, s: Any) -> None:
+    """Write d_hat of the channels of another form than PAIR, after :func:`window_step`; p, s: the records.
+
+    FIR: d_hat = sum_j g_j v_{k-j}.  THIRD: d_hat += theta_3 (h_3,k - lam_3^N h_3,k-N).  FILTER: see Window.
+    """
+    v, head, size = s["v"], s["head"], s["past"].shape[0]
+    for c in range(3):
+        if p["form"][c] == FIR:
+            total = 0.0
+            for j in range(p["N"][c]):
+                total += p["g"][j, c] * s["past"][(head - j) % size, 0, c]
+            s["d_hat"][c] = total
+        elif p["form"][c] == THIRD:
+            value = p["third"][0, c] * s["h_3"][c] + (1.0 - p["third"][0, c]) * v[c]
+            s["h_3"][c] = value
+            s["past_3"][head, c] = value
+            back = (head - p["N"][c]) % size
+            s["d_hat"][c] += p["third"][2, c] * (value - p["third"][1, c] * s["past_3"][back, c])
+        elif p["form"][c] == FILTER:
+            total = 0.0
+            for j in range(3):
+                total += p["M"][c, j] * s["rho"][j]
+            s["work"][c] = total + v[c] - s["d_filter"][c]
+    for c in range(3):
+        if p["form"][c] == FILTER:
+            s["rho"][c] = s["work"][c]
+    for c in range(3):
+        if p["form"][c] == FILTER:
+            for j in range(3):
+                s["d_filter"][c] += p["W"][c, j] * s["rho"][j]
+            s["d_hat"][c] = s["d_filter"][c]
+
+
+@jit
+def shape_fill(s: Any) -> None:
+    """Fill the memory of the forms of :func:`shape_step` with the steady state of the disturbance s['v']."""
+    for c in range(3):
+        s["h_3"][c], s["d_filter"][c], s["rho"][c] = s["v"][c], s["v"][c], 0.0
+        for j in range(s["past_3"].shape[0]):
+            s["past_3"][j, c] = s["v"][c]
+
+
 def impulse_response(window: Window, length: int) -> Array:
     """Response of d_hat to a unit impulse of v, per channel; shape (length, n).
 
-    w_j = sum_i theta_i (1 - lam_i) lam_i^j for j < N, 0 from N on (a conventional DOB goes on).
+    w_j = sum_i theta_i (1 - lam_i) lam_i^j for j < N, 0 from N on (a conventional DOB goes on). Of a filter
+    that couples channels it is each channel's response to its own.
     """
+    weights = _pair_response(window, length)
+    for c, form in enumerate(window.form):
+        if form == FIR:
+            weights[:, c] = np.r_[window.g[:length, c], np.zeros(max(0, length - FIR_MAX))]
+        elif form == THIRD:
+            lam, lam_N, theta = window.third[:, c : c + 1]
+            lam, lam_N, theta = (np.array([a, [0.0]]) for a in (lam, lam_N, theta))
+            one = Window(lam, lam_N, theta, window.N[c : c + 1])
+            weights[:, c] += _pair_response(one, length)[:, 0]
+        elif form == FILTER:
+            weights[:, c] = _filter_response(window, c, length)
+    return weights
+
+
+def _filter_response(window: Window, c: int, length: int) -> Array:
+    """Response of channel c of a linear filter to its own unit impulse."""
+    rho, d, out = np.zeros(window.n), np.zeros(window.n), np.zeros(length)
+    for k in range(length):
+        rho = window.M @ rho - d + (np.arange(window.n) == c) * (k == 0)
+        d = d + window.W @ rho
+        out[k] = d[c]
+    return out
+
+
+def _pair_response(window: Window, length: int) -> Array:
+    """:func:`impulse_response` of two exponentials a channel."""
     j = np.arange(length)[:, None]
     weights = np.zeros((length, window.n))
     for i in range(2):
@@ -192,8 +322,13 @@ class Bounds:
 
 def response_length(window: Window) -> int:
     """Ticks after which a unit impulse has left every channel: N + 1; without a window, 1e-16 is left."""
-    endless = (window.lam_N == 0).all(axis=0)
+    form = window.form if len(window.form) else np.full(window.n, PAIR)
+    endless = (window.lam_N == 0).all(axis=0) & (form == PAIR)
     ticks = window.N.astype(float) + 1
+    if (form == FILTER).any():
+        of = np.block([[window.M, -np.eye(window.n)], [window.W @ window.M, np.eye(window.n) - window.W]])
+        rest = np.abs(np.linalg.eigvals(of[np.ix_(np.tile(form == FILTER, 2), np.tile(form == FILTER, 2))]))
+        ticks[form == FILTER] = np.ceil(np.log(1e-16) / np.log(np.clip(rest.max(), 1e-300, 1 - 1e-16))) + 1
     ticks[endless] = np.ceil(np.log(1e-16) / np.log(np.clip(window.lam[0, endless], 1e-300, 1 - 1e-16))) + 1
     return int(min(ticks.max(), MAX_RESPONSE))
 

@@ -45,7 +45,7 @@ def test_all_mistakes_are_named_at_once(configs: Path) -> None:
         ("limits.w_max_rad_s=nan", "finite"),
         ("limits.u_max_v=inf", "finite"),
         ("limits.v_dc_max_v=1.0", "v_dc_max_v must be above"),
-        ("observer.speed.kind='luenberger'", "'ftdob' or 'dob'"),
+        ("observer.speed.kind='luenberger'", "'exponentials', 'ftdob'"),
         ("reference.kind='triangle'", "reference"),
         ("loop.pacing='sometimes'", "'sync', 'feedback' or 'timer'"),
         ("motor='motors/none.toml'", "can't be read"),

@@ -1,0 +1,114 @@
+"""The registry of laws and observers: what a member says of itself, and how its file is found.
+
+A member is a module of ``hil.control.laws`` or ``hil.control.observers`` with a ``MEMBER``; a package of
+somebody else's names one in the entry point group ``hil.laws`` or ``hil.observers``. From its keys follows
+the table that the configuration accepts, from its design what the compiled tick runs.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+from hil.control.errors import ControlDesignError
+from hil.control.fac import SampledModel
+from hil.control.observer import Window
+
+if TYPE_CHECKING:
+    from hil.control.law import MotorModel
+
+REQUIRED: Final = object()
+"""Default of a key that must be given."""
+Values = Mapping[str, Any]
+"""A config table's keys and values, without ``kind``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """One key of a member's table, its unit in its name; numbers are finite and above ``above``."""
+
+    doc: str
+    default: Any = REQUIRED
+    type: Literal["number", "numbers", "flag"] = "number"
+    above: float | None = 0.0
+    least: float | None = None
+    most: float | None = None
+    count: int = 3
+    """Most entries of ``numbers``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """What an observer's design is told: the channel (0 w, 1 q, 2 d), T_s [s], the joint sampled model."""
+
+    index: int
+    T_s: float
+    model: SampledModel
+
+
+@dataclass(frozen=True, slots=True)
+class Observer:
+    """An observer of one channel; one that needs all channels at once has ``joint`` instead."""
+
+    kind: str
+    doc: str
+    keys: Mapping[str, Key]
+    design: Callable[[Values, Channel], Window] | None = None
+    joint: Callable[[Values, Values, SampledModel], Window] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a law's design is told: the motor that is believed in, its sampled model, T_s [s]."""
+
+    motor: MotorModel
+    model: SampledModel
+    T_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """A law: ``code`` selects its kernel in :func:`hil.control.law.command`; ``design`` yields parameters."""
+
+    kind: str
+    doc: str
+    code: int
+    design: Callable[[Values, Plan], dict[str, Any]]
+    keys: Mapping[str, Key] = field(default_factory=dict)
+
+
+def _found(group: str, kind: Any) -> dict[str, Any]:
+    """Members by kind: those of the folder in the order of their names, then those of other packages."""
+    names = sorted(p.stem for p in Path(__file__).with_name(group).glob("*.py") if p.stem != "__init__")
+    members = [importlib.import_module(f"hil.control.{group}.{name}").MEMBER for name in names]
+    members += [entry.load() for entry in entry_points(group=f"hil.{group}")]
+    found: dict[str, Any] = {}
+    for member in members:
+        if not isinstance(member, kind) or member.kind in found:
+            raise ControlDesignError(f"hil.{group}: {member!r} is no {kind.__name__} or its kind is taken")
+        found[member.kind] = member
+    return found
+
+
+@functools.cache
+def observers() -> dict[str, Observer]:
+    """All observers by kind."""
+    return _found("observers", Observer)
+
+
+@functools.cache
+def laws() -> dict[str, Law]:
+    """All laws by kind."""
+    return _found("laws", Law)
+
+
+def member(kind: str, known: Mapping[str, Any]) -> Any:
+    """The member of that kind. Raises ControlDesignError with those there are."""
+    if kind not in known:
+        raise ControlDesignError(f"kind {kind!r} is not one of {', '.join(known)}")
+    return known[kind]
