@@ -2,68 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 
-from drivers.codec import Database, Message
-from drivers.errors import DatabaseError, EncodeError
-from drivers.mapping import MEASURED, RECEIVED, SENT, STATES, STATUSWORD, DriveMap, Part
+from drivers.bound import MOST_COUNTS, Binding, Bound
+from drivers.codec import CRC_BYTES, Database, Message
+from drivers.errors import DatabaseError
+from drivers.mapcheck import (
+    Names,
+    mistakes_of_frames,
+    mistakes_of_map,
+    mistakes_of_states,
+    mistakes_of_values,
+    plain_states,
+)
+from drivers.mapping import MEASURED, RECEIVED, SENT, DriveMap, Part
+from drivers.payload import NO_PAYLOAD, Layout
 from drivers.signal import Signal
+from drivers.units import FIRST, shown, unit_of
+
+__all__ = ["Binding", "Bound", "bind"]
 
 _COUNTER_PLACE = {2: (8, 4), 5: (16, 8)}
-
-
-@dataclass(frozen=True, slots=True)
-class Bound:
-    """One message of the map: its counter (may be empty) and (part, signal) pairs, in SI units."""
-
-    message: Message
-    counter: str
-    parts: tuple[tuple[str, str], ...]
-    constants: tuple[tuple[str, float], ...] = ()
-
-    @property
-    def counter_modulus(self) -> int:
-        """Number of values of this message's counter; 256 when it has none."""
-        return 1 << self.message.signals[self.counter].length if self.counter else 256
-
-
-@dataclass(frozen=True, slots=True)
-class Binding:
-    """The map's messages: to read, and to write in this order (the one with u_q last)."""
-
-    map: DriveMap
-    incoming: tuple[Bound, ...]
-    outgoing: tuple[Bound, ...]
-    sync: Message | None
-    emergency: Message | None
-    heartbeat: Message | None
-    factors: Mapping[str, float] = field(default_factory=dict)
-    """From the DBC's unit of each part to SI, where they differ."""
-
-    def signal(self, part: str) -> Signal | None:
-        """The signal of a part, in SI units; None when the drive has none."""
-        for bound in self.incoming + self.outgoing:
-            for name, signal in bound.parts:
-                if name == part:
-                    return bound.message.signals[signal]
-        return None
-
-    @property
-    def counters(self) -> dict[str, str]:
-        """The counter of each message that has one, by message name."""
-        bounds = self.incoming + self.outgoing
-        return {bound.message.name: bound.counter for bound in bounds if bound.counter}
-
-    @property
-    def command(self) -> Bound:
-        """The message with u_q."""
-        return self.outgoing[-1]
-
-    @property
-    def counter_modulus(self) -> int:
-        """Number of values of the command's counter, as echoed."""
-        return self.command.counter_modulus
 
 
 def bind(
@@ -80,7 +41,7 @@ class _Binder:
         self._map, self._database, self._period_ms = drive, database, period_ms
         self._mistakes: list[str] = []
         self._factors: dict[str, float] = {}
-        self._counters = dict(self._pairs("counters", drive.counters))
+        self._counters = self._counted()
         skipped = () if load else ("load_torque", "load_enable")
         self._received = self._places(RECEIVED, ())
         self._sent = self._places(SENT, skipped)
@@ -98,6 +59,15 @@ class _Binder:
             else:
                 self._add(f'{what} = "{text}": write it as "MESSAGE.Signal"')
 
+    def _counted(self) -> dict[str, str]:
+        """The counter of each message that has one."""
+        out: dict[str, str] = {}
+        for message, signal in self._pairs("counters", self._map.counters):
+            if message in out:
+                self._add(f"counters: {message} has two, {out[message]} and {signal}; leave one")
+            out[message] = signal
+        return out
+
     def _places(self, parts: dict[str, Part], skipped: tuple[str, ...]) -> dict[str, tuple[str, str]]:
         """(message, signal) of each part that the map has."""
         named = {part: getattr(self._map, part) for part in parts if part not in skipped}
@@ -105,20 +75,47 @@ class _Binder:
 
     def bind(self) -> Binding:
         """Return the binding or raise with all mistakes."""
-        incoming = self._bounds(self._received, RECEIVED)
-        outgoing = self._bounds(self._sent, SENT)
+        incoming = self._incoming()
+        outgoing = self._outgoing()
         last = self._sent.get("u_q", ("", ""))[0]
         outgoing.sort(key=lambda bound: bound.message.name == last)
         sync, emergency, heartbeat = (
             self._message(getattr(self._map, name), name) for name in ("sync", "emergency", "heartbeat")
         )
-        self._check_whole()
+        state = self._state()
+        made = Binding(
+            plain_states(self._map, state),
+            tuple(incoming),
+            tuple(outgoing),
+            sync,
+            emergency,
+            heartbeat,
+            self._factors,
+        )
+        names = Names(self._received, self._sent, tuple(self._all_sent()), self._counters)
+        for mistake in (*mistakes_of_map(self._map, names), *mistakes_of_frames(made, self._database.node)):
+            self._add(mistake)
+        for mistake in mistakes_of_states(self._map, state) if state else ():
+            self._add(mistake)
         self._check_periods(incoming)
-        self._check_zero(outgoing)
+        self._check_echo()
+        for mistake in mistakes_of_values(made):
+            self._add(mistake)
         if self._mistakes:
             raise DatabaseError(f"{self._database.path}: " + "; ".join(self._mistakes))
-        ins, outs = tuple(incoming), tuple(outgoing)
-        return Binding(self._map, ins, outs, sync, emergency, heartbeat, self._factors)
+        return made
+
+    def _state(self) -> Signal | None:
+        """The state's signal as the DBC has it."""
+        pair = self._received.get("state")
+        message = pair and self._message(pair[0], "state", pair[1])
+        return message.signals[pair[1]] if message and pair else None
+
+    def _all_sent(self) -> Iterator[tuple[str, tuple[str, str]]]:
+        """(part, (message, signal)) of all that is ever sent, also of a load that this run leaves alone."""
+        for part in SENT:
+            for pair in self._pairs(part, tuple(filter(None, (getattr(self._map, part),)))):
+                yield part, pair
 
     def _message(self, name: str, part: str, *signals: str) -> Message | None:
         """The message, or None with the mistake noted."""
@@ -130,56 +127,135 @@ class _Binder:
             self._add(f"{part}: {str(error).removeprefix(f'{self._database.path}: ')}")
             return None
 
-    def _bounds(self, places: dict[str, tuple[str, str]], parts: dict[str, Part]) -> list[Bound]:
-        """One bound message for each that the places name."""
-        by_message: dict[str, dict[str, str]] = {}
+    def _by_message(self, places: dict[str, tuple[str, str]]) -> dict[str, dict[str, str]]:
+        """Signal by part of each message that the places name and that has them all."""
+        out: dict[str, dict[str, str]] = {}
         for part, (name, signal) in places.items():
             if self._message(name, part, signal) is not None:
-                by_message.setdefault(name, {})[part] = signal
-        constants = self._constants(by_message) if parts is SENT else {}
-        return [
-            self._bound(name, signals, parts, tuple(constants.get(name, ())))
-            for name, signals in by_message.items()
-        ]
+                out.setdefault(name, {})[part] = signal
+        return out
 
-    def _constants(self, by_message: dict[str, dict[str, str]]) -> dict[str, list[tuple[str, float]]]:
-        out: dict[str, list[tuple[str, float]]] = {}
+    def _incoming(self) -> list[Bound]:
+        """The messages to read; of a multiplexed one a bound for each of its frames."""
+        bounds = []
+        for name, signals in self._by_message(self._received).items():
+            message, counter = self._converted(name, signals, RECEIVED)
+            for selector, wanted, parts in self._frames(message, signals):
+                self._check_shared(message, [*filter(None, (counter,)), *(signal for _, signal in parts)])
+                bounds.append(Bound(message, counter, parts, NO_PAYLOAD, selector, wanted))
+        return bounds
+
+    def _frames(
+        self, message: Message, signals: dict[str, str]
+    ) -> Iterator[tuple[str, tuple[int, ...], tuple[tuple[str, str], ...]]]:
+        """(multiplexer, its values, (part, signal) pairs) of each kind of frame of a received message."""
+        behind = {part: message.behind[name] for part, name in signals.items() if name in message.behind}
+        if not behind:
+            yield "", (), tuple(signals.items())
+            return
+        selectors = {selector for selector, _ in behind.values()}
+        if len(selectors) > 1:
+            self._add(
+                f"{message.name}: what is mapped lies behind {' and '.join(sorted(selectors))}; map one's"
+            )
+            return
+        (selector,) = selectors
+        if self._message(message.name, "multiplexer", selector) is None:
+            return
+        frames: dict[tuple[tuple[str, str], ...], list[int]] = defaultdict(list)
+        for value in sorted({value for _, ids in behind.values() for value in ids})[:MOST_COUNTS]:
+            there = [(p, s) for p, s in signals.items() if p not in behind or value in behind[p][1]]
+            frames[tuple(there)].append(value)
+        for parts, wanted in frames.items():
+            yield selector, tuple(wanted), parts
+
+    def _outgoing(self) -> list[Bound]:
+        """The messages to write, with what stands under each."""
+        by_message = self._by_message(self._sent)
+        constants = self._constants(by_message)
+        bounds = []
+        for name, signals in by_message.items():
+            message, counter = self._converted(name, signals, SENT)
+            values = [*signals.values(), *filter(None, (counter,))]
+            layout = Layout(message, values, constants.get(name, {}))
+            bounds.append(Bound(message, counter, tuple(signals.items()), layout.payload()))
+            for mistake in layout.mistakes:
+                self._add(mistake)
+        return bounds
+
+    def _constants(self, by_message: dict[str, dict[str, str]]) -> dict[str, dict[str, int | float]]:
+        out: dict[str, dict[str, int | float]] = defaultdict(dict)
         for text, value in self._map.constants.items():
             for name, signal in self._pairs("constants", (text,)):
                 if name not in by_message:
                     self._add(f'constants: "{text}": {name} is no message of the command')
                 elif self._message(name, "constants", signal) is not None:
-                    out.setdefault(name, []).append((signal, value))
+                    out[name][signal] = value
         return out
 
-    def _bound(
-        self,
-        name: str,
-        signals: dict[str, str],
-        parts: dict[str, Part],
-        constants: tuple[tuple[str, float], ...],
-    ) -> Bound:
+    def _converted(self, name: str, signals: dict[str, str], parts: dict[str, Part]) -> tuple[Message, str]:
+        """A message with its parts in SI units and its counter from 0 on, and the counter's name."""
         message = self._database.message(name)
         converted = {
             signal: self._checked(part, parts[part], message.signals[signal], f"{name}.{signal}")
             for part, signal in signals.items()
         }
         counter = self._checked_counter(message)
-        return Bound(message.with_signals(converted), counter, tuple(signals.items()), constants)
+        if counter:
+            converted[counter] = _from_zero(message.signals[counter], message.signals[counter].raw_range()[0])
+        return message.with_signals(converted), counter
 
     def _checked(self, part: str, rule: Part, signal: Signal, where: str) -> Signal:
         """The signal in SI units; unit and range are checked."""
         if rule.signed and not signal.minimum < 0.0 < signal.maximum:
             low, high = f"{signal.minimum:g}", f"{signal.maximum:g}"
             self._add(f"{part}: {where} has the range {low} .. {high}; it must reach below and above 0")
+        if part in SENT and signal.is_float and signal.length == 16:
+            self._add(f"{part}: {where} is a float of 16 bits, which can be received only")
         if not rule.units:
-            return signal
-        if signal.unit not in rule.units:
-            known = ", ".join(rule.units)
-            self._add(f"{part}: {where} has the unit {signal.unit!r}; give it one of {known} in the DBC")
-            return signal
-        factor = self._factors[part] = rule.units[signal.unit]
-        return signal if factor == 1.0 else signal.in_unit(next(iter(rule.units)), factor)
+            return self._checked_plain(part, signal, where)
+        factor = self._factor(part, rule.units, signal, where)
+        if factor != 1.0:
+            self._factors[part] = factor
+        return signal if factor == 1.0 else signal.in_unit(FIRST[id(rule.units)], factor)
+
+    def _factor(self, part: str, units: Mapping[str, float], signal: Signal, where: str) -> float:
+        """From a signal's unit to SI, by the map's word or else the DBC's."""
+        given = self._map.units.get(part, self._map.units.get(where))
+        text = signal.unit if given is None else given
+        unit = unit_of(text, units)
+        if unit is None:
+            has = f"has the unit {text!r}" if given is None else f"is given the unit {text!r}"
+            self._add(
+                f"{part}: {where} {has}; give it one of {shown(units)} in the DBC or in drive.signals.units"
+            )
+            return 1.0
+        if not unit.electrical:
+            return unit.factor
+        if not self._map.pole_pairs:
+            self._add(f"{part}: {where} counts electrical turns; that needs the motor's pole pairs")
+        return unit.factor / (self._map.pole_pairs or 1)
+
+    def _checked_plain(self, part: str, signal: Signal, where: str) -> Signal:
+        """A signal that is a number of its own: an echo from 0 on, a raw state without a sign."""
+        bare = (signal.scale, signal.offset, signal.is_float) == (1.0, 0.0, False)
+        if part == "echo":
+            if not bare or signal.signed:
+                self._add(f"echo: {where} must be a plain unsigned number")
+            return _from_zero(signal, self._first_count())
+        if part == "state" and self._map.states:
+            if not bare:
+                self._add(f"state: {where} must be a plain number")
+            return replace(signal, signed=False, minimum=0.0, maximum=float((1 << signal.length) - 1))
+        return signal
+
+    def _first_count(self) -> int:
+        """The number with which the command's counter begins; 0 where it can't be known."""
+        name = self._sent.get("u_q", ("", ""))[0]
+        try:
+            return self._database.message(name).signals[self._counters[name]].raw_range()[0]
+        except (DatabaseError, KeyError):
+            return 0
 
     def _checked_counter(self, message: Message) -> str:
         """The message's counter, checked for its place under its E2E profile; empty for none."""
@@ -195,8 +271,13 @@ class _Binder:
             return ""
         if (signal.scale, signal.offset, signal.signed, signal.is_float) != (1.0, 0.0, False, False):
             self._add(f"counters: {message.name}.{name} must be a plain unsigned number")
-        if signal.length > 8:
-            self._add(f"counters: {message.name}.{name} has {signal.length} bits; at most 8 are used")
+        elif signal.raw_count > MOST_COUNTS:
+            self._add(
+                f"counters: {message.name}.{name} has {signal.length} bits; at most 8 are used, or a range "
+                f"of {MOST_COUNTS} numbers"
+            )
+        elif signal.raw_count < 2:
+            self._add(f"counters: {message.name}.{name} has a range in which nothing can be counted")
         if place is not None and (signal.shift, signal.length) != place:
             self._add(
                 f"counters: {message.name}.{name}: E2E profile {message.profile} has its counter in the "
@@ -204,36 +285,27 @@ class _Binder:
             )
         return name
 
-    def _check_whole(self) -> None:
-        """What concerns more than one signal."""
-        missing = [part for part in (*MEASURED, "state", "u_q", "u_d") if not getattr(self._map, part)]
-        for part in missing:
-            self._add(f'{part}: missing; name it as "MESSAGE.Signal"')
-        if not (self._map.controlword or self._map.enable):
-            self._add("controlword or enable: one of them must be named, or the drive can't be switched off")
-        both = {name for name, _ in self._received.values()} & {name for name, _ in self._sent.values()}
-        for name in sorted(both):
-            self._add(f"{name} is both received and sent; a frame has one sender")
-        for message in self._counters:
-            if not any(message == name for name, _ in (*self._received.values(), *self._all_sent())):
-                self._add(f"counters: {message} is no message of this map")
-        self._check_states()
-        self._check_echo()
+    def _check_periods(self, incoming: list[Bound]) -> None:
+        """Measurements must come at least once a period, by the DBC's cycle time where it has one."""
+        for bound in incoming:
+            measures = any(part in MEASURED for part, _ in bound.parts)
+            cycle = bound.message.cycle_ms
+            if measures and self._period_ms is not None and cycle > self._period_ms:
+                self._add(
+                    f"{bound.message.name} comes every {cycle:g} ms by the DBC, the loop runs every "
+                    f"{self._period_ms:g} ms; lower loop.rate_hz"
+                )
 
-    def _all_sent(self) -> Iterator[tuple[str, str]]:
-        return self._pairs("load", tuple(filter(None, (getattr(self._map, part) for part in SENT))))
-
-    def _check_states(self) -> None:
-        states = self._map.states
-        if isinstance(states, str):
-            if states != STATUSWORD:
-                self._add(f'states = "{states}": a table of raw value = name, or "{STATUSWORD}"')
-            return
-        for raw, name in states.items():
-            if name not in STATES:
-                self._add(f'states: {raw} = "{name}"; known are {", ".join(STATES)}')
-        if states and "operation enabled" not in states.values():
-            self._add('states: no value is "operation enabled"; the drive could never be seen running')
+    def _check_shared(self, message: Message, names: Iterable[str]) -> None:
+        """Each of what is read of one frame must have bits of its own."""
+        seen = (1 << 8 * CRC_BYTES[message.profile]) - 1
+        for name in dict.fromkeys(names):
+            mask = message.signals[name].mask(message.length)
+            if mask & seen:
+                self._add(
+                    f"{message.name}.{name} shares bits with another signal (overlapping); correct the DBC"
+                )
+            seen |= mask
 
     def _check_echo(self) -> None:
         """The echo counts as the command does, or it names the wrong command."""
@@ -253,27 +325,9 @@ class _Binder:
         if echo.length != echoed.length:
             self._add(f"echo: {name}.{signal} has {echo.length} bits, {command}.{counter} {echoed.length}")
 
-    def _check_periods(self, incoming: list[Bound]) -> None:
-        """Measurements must come at least once a period, by the DBC's cycle time where it has one."""
-        for bound in incoming:
-            measures = any(part in MEASURED for part, _ in bound.parts)
-            cycle = bound.message.cycle_ms
-            if measures and self._period_ms is not None and cycle > self._period_ms:
-                self._add(
-                    f"{bound.message.name} comes every {cycle} ms by the DBC, the loop runs every "
-                    f"{self._period_ms:g} ms; lower loop.rate_hz"
-                )
 
-    def _check_zero(self, outgoing: list[Bound]) -> None:
-        """Zero and every constant can be sent: stopping must never fail on a range."""
-        for bound in outgoing:
-            wanted = {signal: 0.0 for _, signal in bound.parts} | dict(bound.constants)
-            for signal, value in wanted.items():
-                one = bound.message.signals[signal]
-                try:
-                    exact = abs(one.to_phys(one.to_bits(value)) - value) <= abs(one.scale) * 1e-6
-                    problem = "" if exact else f"{value:g} is between two steps"
-                except EncodeError as error:
-                    problem = str(error)
-                if problem:
-                    self._add(f"{bound.message.name}.{signal}: {value:g} can't be sent: {problem}")
+def _from_zero(counter: Signal, first: int) -> Signal:
+    """A counter that begins with ``first`` as one that begins with 0."""
+    return replace(
+        counter, offset=-float(first), minimum=counter.minimum - first, maximum=counter.maximum - first
+    )

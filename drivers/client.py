@@ -7,6 +7,7 @@ nothing is sent until the client is closed.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import time
@@ -21,10 +22,11 @@ import numpy.typing as npt
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
 from drivers.codec import Database, Message
-from drivers.errors import EncodeError, LinkDown, LinkError, QueueFull
+from drivers.errors import EncodeError, LinkDown, LinkError
 from drivers.frames import (
     BUS_DOWN,
     EMERGENCY,
+    ENABLE_OPERATION,
     ERROR_FRAME,
     FOREIGN_COMMAND,
     FRESH,
@@ -33,7 +35,7 @@ from drivers.frames import (
     SOURCES,
 )
 from drivers.jit import COMPILED, entry
-from drivers.local import CLASSIC, ERR_FLAG, FD
+from drivers.local import ERR_FLAG
 from drivers.mapping import DriveMap, house_map
 from drivers.port import SocketPort
 from drivers.posix import (
@@ -53,18 +55,17 @@ from drivers.posix import (
 )
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
-from drivers.states import ENABLE_OPERATION, FAULT_RESET, translator
-from drivers.tables import incoming_tables, laid_out, outgoing_tables
-from drivers.wire import FRAME, ROOM, STATE, STATE_RAW, encode, note_sent, take
+from drivers.states import FAULT_RESET, translator
+from drivers.stops import Outgoing, try_all
+from drivers.tables import incoming_tables, outgoing_tables
+from drivers.wire import FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
 STOP_REPEATS: Final = 5
-STOP_PAUSE_S: Final = 0.002
 DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
-Send = Callable[[int], int]
 _GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _DOWN = range(9)
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
@@ -88,16 +89,6 @@ class Compiled(NamedTuple):
     command: npt.NDArray[np.int64]
     sync_bytes: int
     log: npt.NDArray[np.void]
-
-
-class Outgoing:
-    """One message to send: its frame in a buffer, and what lays a command out there."""
-
-    def __init__(self, message: Message, index: int) -> None:
-        self.message, self.index = message, index
-        self.raw = laid_out(message.send_id, message.length, message.fd)
-        self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
-        self.encode: Send = lambda t_ns: -1
 
 
 def _offset(tick: Any, name: str) -> int:
@@ -162,21 +153,36 @@ class DriveClient:
 
     def _make_senders(self) -> None:
         """What lays out and sends each command and SYNC."""
-        messages, signals, constants = outgoing_tables(self.binding)
-        values = np.array([*[0.0] * len(SOURCES), *constants])
+        messages, signals = outgoing_tables(self.binding)
+        values = np.zeros(len(SOURCES))
         values[SOURCES.index("load_enable")] = 1.0
         self._values: Any = values.data
         self._commanding = {"values": values, "messages": messages, "signals": signals}
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
         for out in self._outgoing:
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
-            out.encode = partial(entry(encode, *args, 0), *args)
+            out.encode = partial(entry(encode_command, *args, 0), *args)
         sync = self.binding.sync
         self._sync = None if sync is None else Outgoing(sync, 0)
         if self._sync is not None:
             self._sync.raw[4] = min(self._sync.message.length, 1)
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
+        self._stops = [self._stop_frames(out) for out in self._outgoing]
+
+    def _stop_frames(self, out: Outgoing) -> list[Outgoing]:
+        """The stop frames of one message, ready to be sent, by the command's counter. Raises EncodeError."""
+        frames = []
+        noting = entry(note_sent, self._log, self._state, out.raw, 0)
+        for counter in range(self.binding.counter_modulus):
+            self._lay(counter, 0, 0.0, 0.0, 0.0)
+            if out.encode(0) < 0:
+                self._refuse(out)
+            frame = Outgoing(out.message, out.index)
+            frame.raw[:] = out.raw
+            frame.encode = partial(noting, self._log, self._state, frame.raw)
+            frames.append(frame)
+        return frames
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -385,9 +391,7 @@ class DriveClient:
 
     def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
         """Lay out all frames before the first is sent, then send them, the one with u_q last."""
-        values = self._values
-        values[0], values[1], values[2], values[3], values[4] = counter, controlword, u_q, u_d, T_L
-        values[5], values[6] = controlword == ENABLE_OPERATION, controlword & FAULT_RESET != 0
+        self._lay(counter, controlword, u_q, u_d, T_L)
         now_ns = self._now()
         for out in self._outgoing:
             if out.encode(now_ns) < 0:
@@ -396,12 +400,20 @@ class DriveClient:
             self._transmit(out)
         self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
 
+    def _lay(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
+        """Set what the encoder lays out."""
+        values = self._values
+        values[0], values[1], values[2], values[3], values[4] = counter, controlword, u_q, u_d, T_L
+        values[5], values[6] = controlword == ENABLE_OPERATION, controlword & FAULT_RESET != 0
+
     def _refuse(self, out: Outgoing) -> NoReturn:
         """Raise with the codec's words what of a command can't be sent."""
         bound = self.binding.outgoing[out.index]
         names = dict(bound.parts)
-        out.message.encode({names[part]: self._values[i] for i, part in enumerate(SOURCES) if part in names})
-        raise EncodeError(f"{out.message.name}: can't be sent")
+        bound.encode({names[part]: self._values[i] for i, part in enumerate(SOURCES) if part in names})
+        raise EncodeError(
+            f"{out.message.name}: the frame would say something else than the command; not sent"
+        )
 
     def _transmit(self, out: Outgoing) -> None:
         """Hand a frame that is laid out to the bus."""
@@ -435,18 +447,29 @@ class DriveClient:
         self.stop()
 
     def stop(self) -> None:
-        """Zero voltage and disable, a few times with advancing counters and SYNC; never raises."""
+        """Zero voltage and disable, a few times with advancing counters and SYNC; never raises.
+
+        The frames are ready since before anything was armed: nothing that can be wrong with a command keeps
+        one of them from being sent, and one that can't be sent keeps not the others.
+        """
         counter = self._cells[_LAST_SENT]
         for _ in range(STOP_REPEATS):
             counter = (counter + 1) % self.binding.counter_modulus
-            try:
-                self._send_command(counter, 0, 0.0, 0.0, 0.0)
-                self._send_sync()
-            except QueueFull:
-                time.sleep(STOP_PAUSE_S)
-            except LinkError:
-                break
-        self.flush()
+            try_all([*(partial(self._stop_with, frames[counter]) for frames in self._stops), self._send_sync])
+            self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, 0
+        with contextlib.suppress(Exception):  # the log is not what matters now
+            self.flush()
+
+    def _stop_with(self, frame: Outgoing) -> None:
+        with contextlib.suppress(Exception):  # a log that can't note it does not hold it back
+            frame.encode(self._now())
+        self._transmit(frame)
+
+    def odd_length(self) -> str:
+        """Which message came with another length than the DBC gives it, in words; empty when none did."""
+        odd_id, length = (int(self._state[name][0]) for name in ("odd_id", "odd_length"))
+        odd = [bound.message for bound in self.binding.incoming if bound.message.send_id == odd_id]
+        return f"{odd[0].name}: length {length}, DBC {odd[0].length}" if odd else ""
 
     def listen(self, seconds: float) -> Counter[int]:
         """Only listen; return how often each identifier was seen. Sends nothing."""

@@ -27,4 +27,7 @@ SOURCES: Final = (
     "reset",
     "load_enable",
 )
-"""Values of a command, in the order in which they are handed to the encoder; a message's constants follow."""
+"""Values of a command, in the order in which they are handed to the encoder."""
+CONTROLWORD: Final = SOURCES.index("controlword")
+ENABLE_OPERATION: Final = 0x0F
+"""The one controlword with which a drive may operate."""

@@ -16,10 +16,14 @@ from drivers.states import translator
 
 @dataclass(slots=True)
 class Heard:
-    """What was heard of one message; ``values`` are the newest, in the DBC's units."""
+    """What was heard of one message; ``values`` are the newest, in the DBC's units.
+
+    ``odd_length``: of the newest frame whose length is not the DBC's.
+    """
 
     count: int = 0
     invalid: int = 0
+    odd_length: int | None = None
     jumps: int = 0
     first_ns: int = 0
     last_ns: int = 0
@@ -48,7 +52,6 @@ class Traffic:
 
 def listen(link: Link, database: Database, seconds: float, counters: Mapping[str, str]) -> Traffic:
     """Listen for ``seconds``; a bus that goes down ends it early. ``counters``: signal by message."""
-    by_id = {message.send_id: message for message in database.messages.values()}
     traffic = Traffic()
     end = time.monotonic_ns() + round(seconds * 1e9)
     while (left := end - time.monotonic_ns()) > 0 and not traffic.down:
@@ -60,7 +63,13 @@ def listen(link: Link, database: Database, seconds: float, counters: Mapping[str
             traffic.error_frames += 1
         else:
             if frame is not None:
-                _take(traffic, frame, by_id.get(frame.can_id | frame.flags), counters, time.monotonic_ns())
+                _take(
+                    traffic,
+                    frame,
+                    database.of_frame(frame.can_id | frame.flags),
+                    counters,
+                    time.monotonic_ns(),
+                )
     return traffic
 
 
@@ -80,13 +89,16 @@ def _count(heard: Heard, message: Message, counter: str, data: bytes, now_ns: in
     heard.count += 1
     heard.first_ns = heard.first_ns or now_ns
     heard.last_ns = now_ns
+    if len(data) != message.length:
+        heard.odd_length = len(data)
     if len(data) != message.length or not message.valid(data):
         heard.invalid += 1
         return
     before = heard.values.get(counter)
-    heard.values = dict(message.decode(data))
+    heard.values = {**heard.values, **message.decode(data)}
     if before is not None:
-        heard.jumps += heard.values[counter] != (before + 1) % (1 << message.signals[counter].length)
+        first, last = message.signals[counter].raw_range()
+        heard.jumps += heard.values[counter] != (before + 1 if before < last else first)
 
 
 def part_values(binding: Binding, traffic: Traffic) -> dict[str, float]:
@@ -98,6 +110,7 @@ def part_values(binding: Binding, traffic: Traffic) -> dict[str, float]:
         for part, signal in bound.parts:
             if signal in heard:
                 values[part] = heard[signal] * binding.factors.get(part, 1.0)
-    if translate and "state" in values:
-        values["state"] = translate(int(values["state"]))
+    state = binding.signal("state")
+    if translate and state and "state" in values:
+        values["state"] = translate(int(values["state"]) % (1 << state.length))
     return values

@@ -7,19 +7,14 @@ nowhere else. Binding a map to a DBC checks it whole, and names all mistakes at 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from drivers.codec import Database
 from drivers.errors import DatabaseError
+from drivers.units import CELSIUS, CURRENT, SPEED, TORQUE, VOLTAGE
 
-SPEED: Final = {"rad/s": 1.0, "rpm": math.pi / 30, "1/min": math.pi / 30, "deg/s": math.pi / 180}
-CURRENT: Final = {"A": 1.0, "mA": 1e-3}
-VOLTAGE: Final = {"V": 1.0, "mV": 1e-3}
-CELSIUS: Final = {"degC": 1.0, "C": 1.0, "°C": 1.0}
-TORQUE: Final = {"N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mNm": 1e-3}
 PLAIN: Final[dict[str, float]] = {}
 STATUSWORD: Final = "statusword"
 OFF: Final = -1
@@ -75,9 +70,11 @@ class DriveMap:
     """A drive's parts as ``MESSAGE.Signal``; ``sync``, ``emergency`` and ``heartbeat`` name messages.
 
     An empty part is not there. ``counters``: the frame counter of each message that has one. ``constants``:
-    signals that are always sent with a value. ``states``: CiA 402's name for each raw value of ``state``, or
-    "statusword" to decode CiA 402's; empty when the values are hil's own. A state named "off" reads as what
-    the last controlword leads to short of operation, for drives that know only on and off.
+    signals that are always sent with a value. ``units``: the unit of a part (or ``MESSAGE.Signal``) for which
+    the DBC has another, none or an unknown one. ``pole_pairs``: for electrical speeds. ``states``: CiA 402's
+    name for each raw value of ``state``, or "statusword" to decode CiA 402's; empty when the values are hil's
+    own. A state named "off" reads as what the last controlword leads to short of operation, for drives that
+    know only on and off.
     """
 
     speed: str
@@ -102,7 +99,9 @@ class DriveMap:
     emergency: str = ""
     heartbeat: str = ""
     counters: tuple[str, ...] = ()
-    constants: Mapping[str, float] = field(default_factory=dict)
+    constants: Mapping[str, int | float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    pole_pairs: int | None = None
     states: Mapping[int, str] | str = field(default_factory=dict)
 
 
@@ -140,7 +139,7 @@ def house_map(database: Database) -> DriveMap:
 
 def map_from_table(table: Mapping[str, Any], where: str) -> DriveMap:
     """A map from a config's ``[drive.signals]``. Raises DatabaseError that names all mistakes."""
-    fields = {one.name: one for one in dataclasses.fields(DriveMap)}
+    fields = {one.name: one for one in dataclasses.fields(DriveMap) if one.name != "pole_pairs"}
     mistakes = [f"{key}: unknown; known are {', '.join(fields)}" for key in table if key not in fields]
     required = [name for name, one in fields.items() if _is_required(one)]
     mistakes += [f'{name}: missing; name it as "MESSAGE.Signal"' for name in required if name not in table]
@@ -169,9 +168,22 @@ def _value(key: str, value: Any) -> Any:
             return value
         return _states(value) if isinstance(value, Mapping) else None
     if key == "constants":
-        numbers = isinstance(value, Mapping) and all(isinstance(v, int | float) for v in value.values())
-        return {str(name): float(number) for name, number in value.items()} if numbers else None
+        return _named(value, int | float)
+    if key == "units":
+        return _named(value, str)
     return value if isinstance(value, str) else None
+
+
+def _named(value: Any, kind: Any) -> dict[str, Any] | None:
+    """A table of values of one kind by name, a signal's in quotes or not (TOML reads A.B = 1 as a table)."""
+    if not isinstance(value, Mapping):
+        return None
+    flat: dict[str, Any] = {}
+    for name, one in value.items():
+        inner = one if isinstance(one, Mapping) else {"": one}
+        flat |= {f"{name}.{signal}" if signal else str(name): given for signal, given in inner.items()}
+    right = all(isinstance(one, kind) and not isinstance(one, bool) for one in flat.values())
+    return flat if right else None
 
 
 def _states(value: Mapping[Any, Any]) -> dict[int, str] | None:

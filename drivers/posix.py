@@ -17,10 +17,21 @@ import numba
 import numpy as np
 from numba import types
 
-from drivers.frames import FRESH
+from drivers.frames import ENABLE_OPERATION, FRESH
 from drivers.jit import array_at, jit, waiting
-from drivers.states import ENABLE_OPERATION, FAULT_RESET
-from drivers.wire import DATA_AT, FRAME, MESSAGE, REFUSED, SIGNAL, STATE, STATE_RAW, encode, note, take
+from drivers.states import FAULT_RESET
+from drivers.wire import (
+    DATA_AT,
+    FRAME,
+    MESSAGE,
+    REFUSED,
+    SIGNAL,
+    STATE,
+    STATE_RAW,
+    encode_command,
+    note,
+    take,
+)
 
 _types: Any = types
 carray: Any = numba.carray  # type: ignore[attr-defined]
@@ -205,7 +216,7 @@ def command(places: Any) -> Any:
     state, words = array_at(places, STATES, STATE), array_at(places, WORDS, U4)
     tick, log = array_at(places, TICK, U1), array_at(places, LOG, FRAME)
     gather(values, tick, fields)
-    size = encode(raw, values, 0, messages, signals, state, words, log, now_ns(times))
+    size = encode_command(raw, values, 0, messages, signals, state, words, log, now_ns(times))
     if size == REFUSED:
         return REFUSED_COMMAND
     code = transmit(fds, raw, size, state, log)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from drivers.frames import ENABLE_OPERATION
 from drivers.mapping import OFF, STATES
 
-ENABLE_OPERATION: Final = 0x0F
 FAULT_RESET: Final = 0x80
+CONTROLWORDS: Final = (0x00, 0x02, 0x06, 0x07, ENABLE_OPERATION, FAULT_RESET)
+"""Every controlword that is sent."""
 NOT_READY: Final = 0
 # CiA 402-2, statusword 6041h: (mask, value) of each state
 _STATUSWORD: Final = (

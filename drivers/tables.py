@@ -13,7 +13,7 @@ from drivers.frames import SOURCES, STATUS
 from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
 from drivers.mapping import MEASURED, RECEIVED
 from drivers.signal import Signal
-from drivers.wire import FD_BYTES, MESSAGE, SIGNAL, STATE_RAW, WATCHED
+from drivers.wire import FD_BYTES, MESSAGE, NO_SELECTOR, SIGNAL, STATE_RAW, WATCHED
 
 Records = npt.NDArray[np.void]
 Row = tuple[Signal, int, int, int, bool]
@@ -29,10 +29,13 @@ class Tables:
         self._signals: list[tuple[Any, ...]] = []
 
     def add(self, bound: Bound, rows: list[Row], bit: int = 0, seen: int = 0) -> None:
-        """Add a message with its signals."""
+        """Add a message with its signals; one behind several values of a multiplexer once for each."""
         message, first = bound.message, len(self._signals)
         if bound.counter:
             rows = [(message.signals[bound.counter], 0, 0, 0, True), *rows]
+        count = len(rows)
+        if bound.selector:
+            rows = [*rows, (message.signals[bound.selector], 0, 0, 0, True)]
         for one, at, kind, source, whole in rows:
             low, high = (one.minimum, one.maximum) if one.is_float else one.raw_range()
             self._signals.append(
@@ -41,14 +44,16 @@ class Tables:
             )  # fmt: skip
         ids = np.frombuffer(message.data_ids.ljust(16, b"\0"), "u1")
         modulus = bound.counter_modulus if bound.counter else 0
-        self._messages.append(
-            (message.send_id, message.length, message.profile, ids, modulus, first, len(rows), bit, seen,
-             message.fd)
-        )  # fmt: skip
+        under = np.frombuffer(bound.payload.data.ljust(64, b"\0"), "u1")
+        for wanted in bound.wanted or (0,):
+            self._messages.append(
+                (message.send_id, message.length, message.profile, ids, modulus, first, count, bit, seen,
+                 message.fd, first + count if bound.selector else NO_SELECTOR, wanted, under)
+            )  # fmt: skip
 
     def watch(self, message: Message) -> None:
         """Add a message that is known by its identifier alone."""
-        self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False))
+        self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False, NO_SELECTOR, 0, 0))
 
     def records(self) -> tuple[Records, Records]:
         """(messages, signals) as the kernels take them."""
@@ -61,9 +66,9 @@ def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records,
     Watched besides: what only the controller itself may send, and the drive's emergencies.
     """
     tables, needed = Tables(), 0
-    for index, bound in enumerate(binding.incoming):
+    for bound in binding.incoming:
         parts = {part for part, _ in bound.parts}
-        bit = 1 << index if parts & set(MEASURED) else 0
+        bit = sum(1 << place for place, part in enumerate(MEASURED) if part in parts)
         needed |= bit
         rows = [
             (bound.message.signals[name], *field_in(tick, RECEIVED[part].field), 0, not RECEIVED[part].units)
@@ -86,18 +91,13 @@ def field_in(tick: np.dtype[np.void], name: str) -> tuple[int, int]:
     return int(offset), _KINDS[kind.str]
 
 
-def outgoing_tables(binding: Binding) -> tuple[Records, Records, list[float]]:
-    """(messages, signals, constants) for :func:`drivers.wire.encode`; the constants follow the values."""
+def outgoing_tables(binding: Binding) -> tuple[Records, Records]:
+    """(messages, signals) for :func:`drivers.wire.encode`."""
     tables = Tables()
-    constants: list[float] = []
     for bound in binding.outgoing:
         signals = bound.message.signals
-        rows = [(signals[name], 0, 0, SOURCES.index(part), False) for part, name in bound.parts]
-        for name, value in bound.constants:
-            rows.append((signals[name], 0, 0, len(SOURCES) + len(constants), False))
-            constants.append(value)
-        tables.add(bound, rows)
-    return *tables.records(), constants
+        tables.add(bound, [(signals[name], 0, 0, SOURCES.index(part), False) for part, name in bound.parts])
+    return tables.records()
 
 
 def laid_out(send_id: int, length: int, fd: bool) -> npt.NDArray[np.uint8]:

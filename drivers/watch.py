@@ -46,7 +46,7 @@ class CommandWatch:
         if len(data) == self._message.length and self._message.valid(data):
             u_q, u_d, *counter = self._read(data)
             self._newest = (u_q, u_d)
-            self._by_counter[int(counter[0]) if counter else 0] = self._newest
+            self._by_counter[int(counter[0]) % len(self._by_counter) if counter else 0] = self._newest
 
     def after(self, flush: Callable[[], None]) -> Callable[[int], tuple[float, float]]:
         """:meth:`applied`, once the frames that came are handed on."""

@@ -15,9 +15,11 @@ import numpy as np
 
 from drivers.e2e import CRC8_TABLE
 from drivers.frames import (
+    CONTROLWORD,
     COUNTER_JUMP,
     COUNTER_REPEATED,
     CRC_ERROR,
+    ENABLE_OPERATION,
     FRESH,
     LENGTH_ERROR,
 )
@@ -30,8 +32,9 @@ UNKNOWN: Final = -1
 """What :func:`take` returns for a frame that measures nothing and yet says something to its caller."""
 WATCHED: Final = -1
 """The ``bit`` of a message that is none to take, but of which :func:`take` returns UNKNOWN."""
+NO_SELECTOR: Final = -1
 REFUSED: Final = -1
-"""What :func:`encode` returns for a value that a signal can't carry."""
+"""What :func:`encode` returns for a value that a signal can't carry, or a frame that says something else."""
 CLASSIC_BYTES: Final = 16
 FD_BYTES: Final = 72
 DATA_AT: Final = 8
@@ -55,20 +58,25 @@ MESSAGE: Final = np.dtype(
     [
         ("id", "i8"), ("length", "i8"), ("profile", "i8"), ("ids", "u1", (16,)), ("modulus", "i8"),
         ("first", "i8"), ("count", "i8"), ("bit", "i8"), ("seen", "i8"), ("fd", "?"),
+        ("selector", "i8"), ("wanted", "i8"), ("under", "u1", (64,)),
     ],
     align=True,
 )  # fmt: skip
-"""``modulus`` 0: no counter, else the first signal is one. ``bit``: of a message that measures, 0 for slow
-values; ``seen``: what a good frame is flagged with besides."""
+"""``modulus`` 0: no counter, else the first signal is one. ``bit``: one for each measurement in it, 0 for
+slow values; ``seen``: what a good frame is flagged with besides. ``selector``: the signal that must have the
+value ``wanted``, or NO_SELECTOR; rows of one identifier follow one another. ``under``: what never changes
+of a command."""
 STATE: Final = np.dtype(
     [
         ("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("logged", "i8"),
         ("last_sent", "i8"), ("controlword", "i8"), ("syncs", "i8"), ("pending", "i8"), ("down", "i8"),
+        ("odd_id", "i8"), ("odd_length", "i8"),
     ]
 )  # fmt: skip
 """``last_sent``, ``controlword``: of the last command; ``syncs``: SYNC's counter. ``pending``: flags for the
 next tick; ``down``: the bus was down, nothing more is sent; the client sets both and looks at them.
-``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has."""
+``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has. ``odd_id``,
+``odd_length``: of the newest frame whose length is not its message's."""
 FRAME: Final = np.dtype(
     [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
 )
@@ -170,6 +178,8 @@ def put(tick: Any, g: Any, value: float) -> None:
         tick[at : at + 8].view(np.float64)[0] = value
         return
     whole = np.rint(value) if g["whole"] else value
+    if np.isnan(whole):
+        whole = np.inf  # as a state it is none that is known
     if g["kind"] == U4:
         tick[at : at + 4].view(np.uint32)[0] = int(min(max(whole, 0.0), 4294967295.0))
     elif g["kind"] == I4:
@@ -210,6 +220,20 @@ def find(raw: Any, messages: Any) -> int:
     for index in range(len(messages)):
         if messages[index]["id"] == can_id:
             return index
+    return -1
+
+
+@jit
+def chosen(raw: Any, messages: Any, index: int, signals: Any) -> int:
+    """Place of the row whose multiplexer value a frame has, from its identifier's first on; -1 for none."""
+    while index < len(messages) and messages[index]["id"] == identifier(raw):
+        m = messages[index]
+        if m["selector"] == NO_SELECTOR:
+            return index
+        low, high = halves(raw, m["length"], signals[m["selector"]])
+        if high == 0 and low == m["wanted"]:
+            return index
+        index += 1
     return -1
 
 
@@ -262,10 +286,16 @@ def take(
     if m["bit"] == WATCHED:
         return UNKNOWN
     if int(raw[4]) != m["length"] or (size == CLASSIC_BYTES and m["length"] > 8):
+        s["odd_id"], s["odd_length"] = identifier(raw), int(raw[4])
         return LENGTH_ERROR
     if not is_valid(raw, m):
         return CRC_ERROR
     flags = judge(raw, m, last, index, signals, words)
+    if m["selector"] != NO_SELECTOR:
+        index = chosen(raw, messages, index, signals)
+        if index < 0:
+            return flags & ~FRESH
+        m = messages[index]
     if not flags & FRESH or (late and m["bit"] != 0):
         return flags & ~FRESH
     first = m["first"] + (1 if m["modulus"] > 0 else 0)
@@ -334,20 +364,17 @@ def encode(
     log: Any,
     t_ns: int,
 ) -> int:
-    """Lay a command out in ``raw``, whose first eight bytes stand; return its size on the socket or REFUSED.
+    """Lay a frame out in ``raw``, whose first eight bytes stand; return its size on the socket or REFUSED.
 
-    ``values``: counter, then what :data:`drivers.frames.SOURCES` names, then the constants. The frame is
-    noted in the log as sent at ``t_ns``; it counts once the caller says that it was.
+    ``values``: counter, then what :data:`drivers.frames.SOURCES` names. The frame is noted in the log as sent
+    at ``t_ns``; it counts once the caller says that it was.
     """
     m = messages[index]
-    for at in range(DATA_AT, DATA_AT + m["length"]):
-        raw[at] = 0
+    for at in range(m["length"]):
+        raw[DATA_AT + at] = m["under"][at]
     for place in range(m["first"], m["first"] + m["count"]):
         g = signals[place]
-        value = values[g["source"]]
-        if place == m["first"] and m["modulus"] > 0:
-            value = value % m["modulus"]
-        number = raw_of(g, value)
+        number = raw_of(g, value_of(values, m, g, place))
         if np.isnan(number) or not lay(raw, m["length"], g, number, words):
             return REFUSED
     if m["profile"] == 2:
@@ -357,3 +384,46 @@ def encode(
         raw[DATA_AT], raw[DATA_AT + 1] = crc & 0xFF, crc >> 8
     note(log, state[0], raw, 0, t_ns)
     return FD_BYTES if m["fd"] else CLASSIC_BYTES
+
+
+@jit
+def value_of(values: Any, m: Any, g: Any, place: int) -> Any:
+    """What a signal of a frame must say."""
+    value = values[g["source"]]
+    return value % m["modulus"] if place == m["first"] and m["modulus"] > 0 else value
+
+
+@jit
+def says(raw: Any, values: Any, index: int, messages: Any, signals: Any, words: Any) -> bool:
+    """Does a frame that is laid out, read again, say what it was to say, to half a step each?"""
+    m = messages[index]
+    for place in range(m["first"], m["first"] + m["count"]):
+        g = signals[place]
+        value = value_of(values, m, g, place)
+        off = abs(phys_of(raw, m["length"], g, words) - value)
+        most = (abs(value) + abs(g["offset"])) * 2.0**-22 if g["real"] else abs(g["scale"]) * 0.500001
+        if not off <= most:
+            return False
+    return is_valid(raw, m)
+
+
+@jit
+def encode_command(
+    raw: Any,
+    values: Any,
+    index: int,
+    messages: Any,
+    signals: Any,
+    state: Any,
+    words: Any,
+    log: Any,
+    t_ns: int,
+) -> int:
+    """:func:`encode` for a command. One that does not let the drive operate is read again before it leaves.
+
+    It may say nothing but zero and off, and no table, however wrong, may make anything else of it.
+    """
+    size = encode(raw, values, index, messages, signals, state, words, log, t_ns)
+    if size == REFUSED or values[CONTROLWORD] == ENABLE_OPERATION:
+        return size
+    return size if says(raw, values, index, messages, signals, words) else REFUSED

@@ -39,8 +39,8 @@ class HouseFrames:
 
     def __init__(self, database: Database, *, truth: bool) -> None:
         self.command = database.message("COMMAND", "Counter", "Mode", "Controlword", "VoltageQ", "VoltageD")
-        self.load_command = database.messages.get("LOAD_COMMAND")
-        self.status = database.message("STATUS", *SLOW) if "STATUS" in database.messages else None
+        self.load_command = database.optional("LOAD_COMMAND")
+        self.status = database.message("STATUS", *SLOW) if database.optional("STATUS") else None
         measured = MEASURED if self.status else MEASURED | SLOW
         self.answers = [(database.message("TRUTH", *TRUE), TRUE)] if truth else []
         self.answers += [(self.status, SLOW)] if self.status else []

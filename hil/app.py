@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import platform
 import signal
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -118,27 +119,30 @@ class RunResult:
 def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
     """The configured map of the drive's signals, else the house protocol's. Raises DatabaseError."""
     table = config.drive.signals
-    return house_map(database) if table is None else map_from_table(table, f"{where}: drive.signals")
+    if table is None:
+        return house_map(database)
+    return replace(map_from_table(table, f"{where}: drive.signals"), pole_pairs=config.motor.n_p)
 
 
 def wire_facts(binding: Binding) -> WireFacts:
     """What the kernel needs of the frames, in SI units."""
-    u_q, load = binding.signal("u_q"), binding.signal("load_torque")
+    load = binding.signal("load_torque")
     measured = [signal for part in MEASURED if (signal := binding.signal(part))]
-    assert u_q is not None and len(measured) == 3  # noqa: S101 - a binding without them is refused
+    assert len(measured) == 3  # noqa: S101 - a binding without them is refused
     return WireFacts(
-        u_lsb=u_q.scale,
-        T_L_lsb=load.scale if load else 0.01,
+        u_lsb=binding.u_step,
+        T_L_lsb=load.step if load else 0.01,
         counter_modulus=binding.counter_modulus,
-        x_lsb=(measured[0].scale, measured[1].scale, measured[2].scale),
-        u_top=u_q.top,
+        x_lsb=(measured[0].step, measured[1].step, measured[2].step),
+        u_top=binding.u_top,
+        T_L_top=load.top if load else math.inf,
     )
 
 
 def load_setup(path: Path, overrides: Overrides) -> Setup:
     """Load and check everything of a run without opening or sending anything."""
     config = load_toml(path, RunConfig, overrides.as_settings())
-    database = Database(path.parent / config.drive.dbc, config.drive.node_id)
+    database = Database(path.parent / config.drive.dbc, config.drive.node_id, config.drive.node_rule)
     load = config.controller.kind == "fac"
     parts = drive_map(config, database, str(path))
     period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
@@ -289,6 +293,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
                     "counter_modulus": setup.wire.counter_modulus,
                     "x_lsb": setup.wire.x_lsb,
                     "u_top": setup.wire.u_top,
+                    **({"T_L_top": setup.wire.T_L_top} if math.isfinite(setup.wire.T_L_top) else {}),
                 }
             ),
             **{f"version {name}": package_version(name) for name in packages},

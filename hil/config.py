@@ -161,7 +161,9 @@ class DriveTable(Table):
     """The drive: its DBC and node."""
 
     dbc: str
-    node_id: Annotated[int, Field(ge=1, le=127)] = 1
+    node_id: Annotated[int, Field(ge=0, le=255)] = 1
+    node_rule: str = ""
+    """Where the node's number goes in identifiers, as "id << 5"; empty: CANopen's."""
     heartbeat_timeout_s: Positive = 3.0
     signals: dict[str, Any] | None = None
     """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""

@@ -37,6 +37,7 @@ class WireFacts:
     counter_modulus: int
     x_lsb: tuple[float, float, float]
     u_top: float
+    T_L_top: float = math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +152,7 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
         "i_trip": limits.i_trip_a,
         "u_max": min(limits.u_max_v, wire.u_top),
         "du_max": limits.du_max_v,
-        "T_L_max": limits.T_L_max_n_m,
+        "T_L_max": min(limits.T_L_max_n_m, wire.T_L_top),
         "v_dc_min": limits.v_dc_min_v,
         "v_dc_max": limits.v_dc_max_v,
         "temperature_max": limits.temperature_max_c,

@@ -88,7 +88,8 @@ def wire_of_log(log: Log) -> WireFacts:
     try:
         wire = json.loads(log.metadata["run"]["wire"])
         lsb = tuple(wire["x_lsb"])
-        return WireFacts(wire["u_lsb"], wire["T_L_lsb"], wire["counter_modulus"], lsb, wire["u_top"])
+        top = wire.get("T_L_top", math.inf)
+        return WireFacts(wire["u_lsb"], wire["T_L_lsb"], wire["counter_modulus"], lsb, wire["u_top"], top)
     except (KeyError, ValueError, TypeError) as error:
         raise HilError(f"{log.path}: has no usable wire facts in it ({error})") from error
 

@@ -55,7 +55,12 @@ BO_ 2566852864 Demand: 12 Ecu
 BO_ 1000 Chatter: 8 Inverter
  SG_ Which M : 0|8@1+ (1,0) [0|255] "" Ecu
  SG_ A m0 : 8|8@1+ (1,0) [0|255] "" Ecu
- SG_ B m1 : 8|8@1+ (1,0) [0|255] "" Ecu
+ SG_ B m1M : 8|8@1+ (1,0) [0|255] "" Ecu
+ SG_ C m2 : 16|8@1+ (1,0) [0|255] "" Ecu
+
+SG_MUL_VAL_ 1000 A Which 0-0;
+SG_MUL_VAL_ 1000 B Which 1-1;
+SG_MUL_VAL_ 1000 C B 2-2;
 
 BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;
 BA_DEF_DEF_ "GenMsgCycleTime" 0;
@@ -222,14 +227,14 @@ def test_the_house_protocol_binds(name: str, load: bool) -> None:
 
 
 CHANGES: list[tuple[dict[str, Any], str]] = [
-    ({"speed": "MotorSpeeds.Rpm"}, "speed: has no message MotorSpeeds; it has Demand"),
+    ({"speed": "MotorSpeeds.Rpm"}, "speed: has no message MotorSpeeds; it has Chatter, Demand"),
     ({"speed": "MotorSpeed.Spin"}, "speed: message MotorSpeed has no signal Spin; it has Rpm, Mode"),
     ({"speed": "MotorSpeedRpm"}, 'speed = "MotorSpeedRpm": write it as "MESSAGE.Signal"'),
     ({"speed": ""}, "speed: missing"),
     ({"speed": "MotorCurrent.Iq"}, "speed: MotorCurrent.Iq has the unit 'mA'; give it one of rad/s, rpm"),
     ({"i_q": "Supply.Udc"}, "it must reach below and above 0"),
     ({"v_dc": "MotorSpeed.Mode"}, "v_dc: MotorSpeed.Mode has the unit ''"),
-    ({"limited": "Chatter.A"}, "multiplexed"),
+    ({"limited": "Chatter.C"}, "multiplexed by more than one value"),
     ({"enable": ""}, "controlword or enable: one of them must be named"),
     ({"echo": "MotorSpeed.Mode"}, "echo: MotorSpeed.Mode has 8 bits, Demand.Alive 4"),
     ({"echo": "MotorSpeed.Mode", "counters": ()}, "echo: Demand has no counter to echo"),

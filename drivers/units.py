@@ -1,0 +1,93 @@
+"""Units as people write them in DBC files, and the factor of each to SI; what is ambiguous is none.
+
+Amplitude-invariant dq: a current or voltage of A or V rms is sqrt(2) of its peak. Electrical speeds need the
+number of pole pairs.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+ELECTRICAL: Final = math.nan
+"""Stands for the factor of a speed that counts electrical turns: it is pi / 30 by the pole pairs."""
+_TURN: Final = 2.0 * math.pi
+_RMS: Final = math.sqrt(2.0)
+
+
+def _table(*rows: tuple[float, str]) -> dict[str, float]:
+    return {name: factor for factor, names in rows for name in names.split()}
+
+
+# written without blanks, brackets and signs of multiplication; the first is SI
+SPEED: Final = _table(
+    (1.0, "rad/s rad/sec rads/s rad/second rads-1 rads^-1 radian/s radians/s 1rad/s"),
+    (
+        math.pi / 30.0,
+        "rpm 1/min r/min rev/min min-1 min^-1 /min u/min turns/min rotations/min revs/min 1/minute",
+    ),
+    (1000.0 * math.pi / 30.0, "krpm"),
+    (_TURN, "rev/s rps r/s revs/s turns/s turn/s u/s rev/sec rotations/s"),
+    (math.pi / 180.0, "deg/s °/s deg/sec degree/s degrees/s"),
+    (ELECTRICAL, "erpm erev/min e-rpm rpm_el rpmel rpm(el)"),
+)
+CURRENT: Final = _table(
+    (1.0, "A Apk Ap Apeak A_peak Apeak Amp Amps ampere amperes"),
+    (1e-3, "mA mApk mAmp"),
+    (_RMS, "Arms A_rms Aeff Amprms"),
+    (1e-3 * _RMS, "mArms mA_rms"),
+)
+VOLTAGE: Final = _table((1.0, "V Vpk Vp Vpeak V_peak Volt Volts VDC V_dc"), (1e-3, "mV"), (1e3, "kV"))
+CELSIUS: Final = _table((1.0, "degC C °C ºC ℃ Celsius degreeC degreesC gradC degCelsius deg_C"))
+TORQUE: Final = _table((1.0, "Nm N_m newtonmeter newtonmetre"), (1e-3, "mNm"), (1e3, "kNm"))
+FIRST: Final = {
+    id(SPEED): "rad/s",
+    id(CURRENT): "A",
+    id(VOLTAGE): "V",
+    id(CELSIUS): "degC",
+    id(TORQUE): "N m",
+}
+_SHOWN: Final = {
+    id(SPEED): "rad/s, rpm, 1/min, rev/s, deg/s, erpm",
+    id(CURRENT): "A, mA, Arms",
+    id(VOLTAGE): "V, mV, kV",
+    id(CELSIUS): "degC",
+    id(TORQUE): "N m, mNm",
+}
+_SPELLING: Final = str.maketrans({"⁻": "-", "¹": "1", "−": "-"} | dict.fromkeys("·*×⋅ \xa0\t[]"))
+_MILLI: Final = re.compile(r"M(?=v|a|n)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit that is known: its factor to SI."""
+
+    factor: float
+    electrical: bool = False
+
+
+def shown(units: Mapping[str, float]) -> str:
+    """The units that are known, as they are told to somebody who wrote another."""
+    return _SHOWN[id(units)]
+
+
+def plain(text: str) -> str:
+    """A unit without what means nothing: blanks, brackets, signs of multiplication, a quantity before it."""
+    return text.strip().rpartition(":")[2].translate(_SPELLING).replace("Â", "").replace("N-m", "Nm")
+
+
+def unit_of(text: str, units: Mapping[str, float]) -> Unit | None:
+    """What a unit is among those of a quantity; None for one that is not known or could be two.
+
+    Upper and lower case are the same, but for M and m, which are a factor of a thousand million.
+    """
+    wanted = plain(text)
+    factor = units.get(wanted)
+    if factor is None and not (wanted.startswith("M") and _MILLI.match(wanted)):
+        factor = {name.lower(): value for name, value in units.items()}.get(wanted.lower())
+    if factor is None:
+        return None
+    return Unit(math.pi / 30.0, electrical=True) if math.isnan(factor) else Unit(factor)
