@@ -34,7 +34,7 @@ from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
-from hil.guardian import GuardedDrive, Words, guardian
+from hil.guardian import GuardedDrive, Rights, Words, guardian
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.log.split import part_path
 from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
@@ -400,8 +400,9 @@ def _guarding(setup: Setup) -> Iterator[Words | None]:
     if alone or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
         yield None
     else:
-        timeout_ns = config.guardian.timeout_ns(loop)
-        with guardian(timeout_ns, config.realtime.fifo_priority, lambda: _client(setup)) as words:
+        timeout_ns, asked = config.guardian.timeout_ns(loop), config.realtime
+        rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
+        with guardian(timeout_ns, rights, lambda: _client(setup)) as words:
             yield words
 
 

@@ -1,11 +1,11 @@
 """The guardian: a process beside the loop that sends the stop frames when the loop no longer can.
 
-It watches the controller's death (pidfd: SIGKILL, a crash) and its heartbeat (SIGSTOP, a deadlock), each
-tick's time in a word of shared memory that costs the loop one store. When either fails while the drive is
-armed it latches ``FIRED`` and sends zero voltage and disable, repeated, through a link of its own. A
-controller that wakes up again finds the latch before its next frame and never sends again; should one frame
-have been between its last look and the socket, the guardian sees the sign of life and sends the stop frames
-once more.
+It watches the controller's death (SIGKILL, a crash: a mutex that its thread holds, and a pidfd as the second
+sign) and its heartbeat (SIGSTOP, a deadlock), each tick's time in a word of shared memory that costs the loop
+one store. When either fails while the drive is armed it latches ``FIRED`` and sends zero voltage and disable,
+repeated, through a link of its own. A controller that wakes up again finds the latch before its next frame
+and never sends again; should one frame have been between its last look and the socket, the guardian sees the
+sign of life and sends the stop frames once more.
 
 Not seen by it: a controller that ticks on but computes nonsense (the guard's part), and a host that is
 dead as a whole (the drive's own watchdog's part).
@@ -15,24 +15,32 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import mmap
 import os
 import select
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol
 
 from numba.extending import register_jitable
 
+from hil import realtime
 from hil.clock import RealClock
 from hil.errors import HilError
+from hil.lifeline import BYTES, Lifeline
 from hil.ports import Drive
 from hil.signals import DriveState, RxFlag, cell
 
 GUARDIAN_LOST_NS = 500_000_000
 """Age of the guardian's own heartbeat, at the controller's newest, at which the controller stops the run."""
+LOOK_NS = 100_000_000
+"""The guardian beats at least that often, whatever its timeout."""
 START_S = 5.0
+END_S = 5.0
+"""How long a guardian that was relieved may take to end."""
 STOPS = 3
 """How often the drive client's sequence of stop frames is sent when the guardian fires."""
 
@@ -69,10 +77,15 @@ class Stopper(Protocol):
 
 
 class Words:
-    """Shared words of controller and guardian; a store or load of one is atomic on every 64-bit machine."""
+    """Shared words of controller and guardian; a store or load of one is atomic on every 64-bit machine.
+
+    Behind them lies the mutex that the controller's loop holds while it lives.
+    """
 
     def __init__(self) -> None:
-        self.cells: Any = memoryview(mmap.mmap(-1, mmap.PAGESIZE)).cast("q")
+        memory = memoryview(mmap.mmap(-1, mmap.PAGESIZE))
+        self.lifeline = Lifeline(memory[-BYTES:])
+        self.cells: Any = memory[:-BYTES].cast("q")
 
 
 class GuardedDrive:
@@ -134,16 +147,16 @@ class Judge:
         self._cells, self._timeout_ns, self._stopper = words.cells, timeout_ns, stopper
         self._answered = 0
 
-    def wait_ms(self, now_ns: int) -> int:
-        """Beat, and answer a sign of life after the latch; return the time to the next look [ms]."""
+    def next_look(self, now_ns: int) -> int:
+        """Beat, and answer a sign of life after the latch; return the time of the next look [ns]."""
         cells = self._cells
         beat = cells[BEAT_NS]
         if cells[FIRED] and beat != self._answered:  # once more: a frame may have been on its way
             self._answered = beat
             self._stopper.stop_from(cells[COUNTER])
         cells[GUARD_NS] = now_ns
-        left_ns = beat + self._timeout_ns - now_ns if self._watching() else self._timeout_ns
-        return int(max(left_ns, 0) // 1_000_000 + (left_ns > 0))
+        latest = now_ns + min(LOOK_NS, self._timeout_ns)
+        return min(latest, beat + self._timeout_ns + 1) if self._watching() else latest
 
     def judge(self, now_ns: int, gone: bool) -> None:
         """Fire, once, when the controller is gone or was silent for longer than the timeout while armed."""
@@ -164,12 +177,37 @@ def watch(words: Words, parent_fd: int, timeout_ns: int, stopper: Stopper) -> No
     poll.register(parent_fd, select.POLLIN)
     gone = False
     while not gone:
-        gone = bool(poll.poll(judge.wait_ms(now())))
+        gone = words.lifeline.given_up_by(judge.next_look(now())) or bool(poll.poll(0))
         judge.judge(now(), gone)
 
 
+@dataclass(frozen=True, slots=True)
+class Rights:
+    """What the guardian asks of the system for itself: FIFO above the loop's, locked memory, another core."""
+
+    priority: int = 0
+    lock_memory: bool = False
+    loop_cpu: int | None = None
+
+    def acquire(self) -> None:
+        """Take what is granted. The collector would touch every page that is shared with the controller."""
+        gc.disable()
+        gc.freeze()
+        if self.priority > 0:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(self.priority + 1, 99)))
+        if self.lock_memory:
+            realtime.lock_as_touched()
+        realtime.keep_off(0, self.loop_cpu)
+
+
 def _serve(
-    words: Words, timeout_ns: int, priority: int, open_stopper: Callable[[], Stopper], report: int
+    words: Words,
+    timeout_ns: int,
+    parent: int,
+    rights: Rights,
+    open_stopper: Callable[[], Stopper],
+    report: int,
 ) -> None:
     """The guardian's whole life, in the forked child; never returns to the caller's code."""
     try:
@@ -177,15 +215,16 @@ def _serve(
         for number in (signal.SIGINT, signal.SIGHUP):
             signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        parent_fd = os.pidfd_open(os.getppid())
+        parent_fd = os.pidfd_open(parent)
         stopper = open_stopper()
-        if priority > 0:
-            with contextlib.suppress(OSError):
-                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(priority + 1, 99)))
+        rights.acquire()
         words.cells[Word.GUARD_NS] = RealClock().now_ns()
         os.write(report, b"ready")
         os.close(report)
         watch(words, parent_fd, timeout_ns, stopper)
+        for late in (parent, 0):  # the end of two large processes with FIFO would take two cores for 30 ms
+            with contextlib.suppress(OSError):
+                realtime.release(late)
         os._exit(0)
     except BaseException as error:  # noqa: BLE001 - a forked child must not run the parent's handlers
         with contextlib.suppress(OSError):
@@ -194,26 +233,38 @@ def _serve(
 
 
 @contextlib.contextmanager
-def guardian(timeout_ns: int, priority: int, open_stopper: Callable[[], Stopper]) -> Iterator[Words]:
-    """A guardian while the block runs. Fork it before the recorder: it must not hold the recorder's pipes.
+def guardian(timeout_ns: int, rights: Rights, open_stopper: Callable[[], Stopper]) -> Iterator[Words]:
+    """A guardian while the block runs, which must be in the thread that runs the loop.
 
-    ``open_stopper`` runs in the guardian and opens a link of its own. Raises HilError when it can't start.
+    Fork it before the recorder: it must not hold the recorder's pipes. ``open_stopper`` runs in the guardian
+    and opens a link of its own. Raises HilError when it can't start.
     """
-    words = Words()
+    words, parent = Words(), os.getpid()
+    words.lifeline.hold()
     ours, theirs = os.pipe()
     pid = os.fork()
     if pid == 0:
         os.close(ours)
-        _serve(words, timeout_ns, priority, open_stopper, theirs)
+        _serve(words, timeout_ns, parent, rights, open_stopper, theirs)
     os.close(theirs)
     try:
         _await_ready(ours)
         yield words
     finally:
         os.close(ours)
-        if words.cells[Word.ARMED] == 0:  # else the controller is failing: the guardian outlives it
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
+        words.lifeline.hand_on()  # it ends; if the drive is still armed, not without the stop frames
+        _await_end(pid)
+
+
+def _await_end(pid: int) -> None:
+    """Wait for the guardian, which was relieved; one that hangs is ended."""
+    fd = os.pidfd_open(pid)
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    if not poll.poll(END_S * 1000):
+        os.kill(pid, signal.SIGKILL)
+    os.close(fd)
+    os.waitpid(pid, 0)
 
 
 def _await_ready(ours: int) -> None:
@@ -222,4 +273,4 @@ def _await_ready(ours: int) -> None:
     poll.register(ours, select.POLLIN)
     said = os.read(ours, 1000).decode(errors="replace") if poll.poll(START_S * 1000) else "no answer"
     if said != "ready":
-        raise HilError(f"the guardian can't start: {said}; nothing was sent")
+        raise HilError(f"the guardian can't start: {said or 'it has ended'}; nothing was sent")

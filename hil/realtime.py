@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from hil.config import RealtimeTable
 
 _MCL_CURRENT_AND_FUTURE = 3
+_MCL_ONFAULT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +31,11 @@ def acquire(table: RealtimeTable) -> list[Grant]:
     return [*_fifo(table.fifo_priority), *_memory(table.lock_memory), *_core(table.cpu), freeze_collector()]
 
 
-def release() -> None:
-    """Give FIFO scheduling back, so that what follows the loop disturbs nobody."""
-    if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
+def release(pid: int = 0) -> None:
+    """Give FIFO scheduling back, so that what follows the loop disturbs nobody; ``pid`` 0: here."""
+    if os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
         # the flag stays: only a privileged process may take it back
-        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+        os.sched_setscheduler(pid, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
 
 
 def probe(table: RealtimeTable) -> list[Grant]:
@@ -67,6 +68,11 @@ def _memory(wanted: bool) -> list[Grant]:
         detail = os.strerror(ctypes.get_errno()) + "; raise memlock in /etc/security/limits.d"
         return [Grant("locked memory", False, detail)]
     return [Grant("locked memory", True, "current and future pages")]
+
+
+def lock_as_touched() -> bool:
+    """Lock each page that this process touches from its first touch on: a fork's shared pages stay shared."""
+    return bool(ctypes.CDLL(None).mlockall(_MCL_CURRENT_AND_FUTURE | _MCL_ONFAULT) == 0)
 
 
 def _core(cpu: int | None) -> list[Grant]:

@@ -26,7 +26,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hil import cli
 from hil.app import Overrides, load_setup
 from hil.config import RunConfig, load_toml
 from hil.emulate import make_node
@@ -35,11 +34,11 @@ from hil.log.reader import open_log
 from hil.log.recover import recover
 from hil.signals import DriveState
 from hil.simulate import simulate_ticks
+from tests.crash.delay import delays, verdict
+from tests.crash.processes import CONFIG, PATIENCE_S, alive, ended, forked
 
-CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.toml"
 VICTIMS = ("controller", "writer", "emulator", "guardian")
 AT_REST = ("SWITCH_ON_DISABLED", "FAULT")
-PATIENCE_S = 90.0
 SECOND_NS = 1_000_000_000
 ATTEMPTS = 10
 
@@ -57,34 +56,6 @@ class Trial:
 
 class TooLateError(Exception):
     """The run had ended before the kill."""
-
-
-def forked(output: Path, *words: str) -> int:
-    """A hil command as a forked process in a session of its own; its standard output goes to a file."""
-    pid = os.fork()
-    if pid:
-        return pid
-    code = 70
-    try:
-        os.setsid()
-        target = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-        os.dup2(target, 1)
-        os.dup2(os.open(output.with_suffix(".err"), os.O_WRONLY | os.O_CREAT, 0o600), 2)
-        code = cli.main(list(words))
-        sys.stdout.flush()
-    finally:
-        os._exit(code)
-
-
-def ended(pid: int, within_s: float = PATIENCE_S) -> int | None:
-    """Exit code of a child, None when it has not ended in time."""
-    end = time.monotonic() + within_s
-    while time.monotonic() < end:
-        done, status = os.waitpid(pid, os.WNOHANG)
-        if done:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.01)
-    return None
 
 
 def children(pid: int) -> dict[int, str]:
@@ -120,14 +91,6 @@ def until(condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
             return True
         time.sleep(0.02)
     return False
-
-
-def alive(pid: int) -> bool:
-    """A process that has ended has no command line, even while nobody has waited for it."""
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes() != b""
-    except OSError:
-        return False
 
 
 def run_trial(trial: Trial, base: Path) -> Trial:
@@ -278,6 +241,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--delays", type=int, help="kills that are timed (default: as many as --kills)")
     args = parser.parse_args()
     begin = time.monotonic()
     done = kills(args.kills, args.seed)
@@ -291,7 +255,11 @@ def main() -> int:
         f"{len(done) - len(bad)} of {len(done)} kills survived ({counts}), "
         f"seed {args.seed}, {time.monotonic() - begin:.0f} s; {missed} runs ended before the kill"
     )
-    return 1 if bad or len(done) != args.kills else 0
+    count = args.kills if args.delays is None else args.delays
+    with tempfile.TemporaryDirectory() as folder:
+        in_time, found = verdict(delays(count, args.seed, Path(folder)), count) if count else (True, "")
+    print(found)
+    return 1 if bad or len(done) != args.kills or not in_time else 0
 
 
 if __name__ == "__main__":

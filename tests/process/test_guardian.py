@@ -20,7 +20,7 @@ from drivers.codec import Database
 from hil.app import Overrides
 from hil.demo import emulator_process
 from hil.errors import HilError
-from hil.guardian import GuardedDrive, Word, guardian
+from hil.guardian import STOPS, GuardedDrive, Rights, Word, guardian, guardian_flags
 from hil.log.reader import open_log
 from hil.signals import DriveState, Reason, RxFlag, new_ticks
 from tests.conftest import CONFIGS
@@ -207,7 +207,7 @@ class Quiet:
 
 def test_a_loop_that_hangs_is_stopped_and_stays_stopped() -> None:
     ours, theirs = os.pipe()
-    with guardian(50_000_000, 0, lambda: Wire(theirs)) as words:
+    with guardian(50_000_000, Rights(), lambda: Wire(theirs)) as words:
         os.set_blocking(ours, False)
         drive, tick = Quiet(), new_ticks()[0]
         guarded = GuardedDrive(drive, words, time.monotonic_ns)
@@ -228,12 +228,38 @@ def test_a_loop_that_hangs_is_stopped_and_stays_stopped() -> None:
         assert int(tick["rx_flags"]) & int(RxFlag.GUARDIAN)
 
 
+def test_a_loop_that_ends_while_armed_is_stopped_before_its_process_goes_on() -> None:
+    ours, theirs = os.pipe()
+    with guardian(60_000_000_000, Rights(), lambda: Wire(theirs)) as words:
+        words.cells[Word.COUNTER], words.cells[Word.ARMED] = 9, 1
+    os.set_blocking(ours, False)
+    assert os.read(ours, 100) == bytes((9,)) * STOPS
+
+
+def test_a_loop_that_ends_disarmed_sends_nothing() -> None:
+    ours, theirs = os.pipe()
+    with guardian(60_000_000_000, Rights(), lambda: Wire(theirs)):
+        pass
+    os.set_blocking(ours, False)
+    with pytest.raises(BlockingIOError):
+        os.read(ours, 100)
+
+
+def test_a_guardian_with_a_long_timeout_is_not_lost() -> None:
+    _, theirs = os.pipe()
+    with guardian(3_000_000_000, Rights(), lambda: Wire(theirs)) as words:
+        for _ in range(20):
+            time.sleep(0.05)
+            words.cells[Word.BEAT_NS] = time.monotonic_ns()
+            assert guardian_flags(words.cells) == 0
+
+
 def test_a_guardian_that_can_not_open_its_link_says_why() -> None:
     def fail() -> Wire:
         raise OSError("no such bus")
 
     with (
         pytest.raises(HilError, match=r"can't start: OSError: no such bus; nothing was sent"),
-        guardian(10_000_000, 0, fail),
+        guardian(10_000_000, Rights(), fail),
     ):
         raise AssertionError("it must not run")

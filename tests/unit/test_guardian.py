@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
 
 from hil.guardian import (
     GUARDIAN_LOST_NS,
+    LOOK_NS,
     STOPS,
     GuardedDrive,
     Judge,
@@ -62,21 +65,27 @@ class Case:
         return int(self.words.cells[Word.FIRED])
 
 
-@pytest.mark.parametrize(
-    ("since_beat", "wait_ms"),
-    [(0, 51), (1, 50), (TIMEOUT - 1_000_001, 2), (TIMEOUT - 1, 1), (TIMEOUT, 0), (TIMEOUT + 5_000_000, 0)],
-)
-def test_the_next_look_is_when_the_heartbeat_is_due(since_beat: int, wait_ms: int) -> None:
-    """Rounded up, so that it is not before; a look that is late waits for nothing."""
+@pytest.mark.parametrize("since_beat", [0, 1, TIMEOUT - 1, TIMEOUT, TIMEOUT + 5_000_000])
+def test_the_next_look_is_when_the_heartbeat_is_due(since_beat: int) -> None:
+    """A nanosecond later, so that it is not before; one that is overdue is now."""
     case = Case(beat=1000)
-    assert case.judge.wait_ms(1000 + since_beat) == wait_ms
+    assert case.judge.next_look(1000 + since_beat) == min(1000 + TIMEOUT + 1, 1000 + since_beat + TIMEOUT)
     assert case.words.cells[Word.GUARD_NS] == 1000 + since_beat and case.stops.after == []
 
 
 @pytest.mark.parametrize(("armed", "fired"), [(0, 0), (1, 1), (0, 1)])
 def test_without_a_heartbeat_to_wait_for_it_looks_every_timeout(armed: int, fired: int) -> None:
     case = Case(armed=armed, fired=fired, beat=0)
-    assert case.judge.wait_ms(10 * TIMEOUT) == 51
+    assert case.judge.next_look(10 * TIMEOUT) == 11 * TIMEOUT
+
+
+@pytest.mark.parametrize("armed", [0, 1])
+@pytest.mark.parametrize("timeout_ns", [LOOK_NS - 1, LOOK_NS, LOOK_NS + 1, 60_000_000_000, 10**309])
+def test_it_beats_often_enough_whatever_its_timeout(timeout_ns: int, armed: int) -> None:
+    case = Case(armed=armed, beat=5_000)
+    judge = Judge(case.words, timeout_ns, case.stops)
+    assert judge.next_look(5_000) - 5_000 == min(LOOK_NS, timeout_ns)
+    assert LOOK_NS == 100_000_000 and 4 * LOOK_NS < GUARDIAN_LOST_NS
 
 
 @pytest.mark.parametrize(
@@ -124,22 +133,22 @@ def test_each_sign_of_life_after_the_latch_is_answered_once() -> None:
     case = Case(beat=1000)
     case.judge.judge(10 * TIMEOUT, False)
     case.stops.after.clear()
-    case.judge.wait_ms(11 * TIMEOUT)
+    case.judge.next_look(11 * TIMEOUT)
     assert case.stops.after == [], "nothing was heard since"
     case.words.cells[Word.BEAT_NS], case.words.cells[Word.COUNTER] = 11 * TIMEOUT, 12
-    case.judge.wait_ms(12 * TIMEOUT)
-    case.judge.wait_ms(12 * TIMEOUT)
+    case.judge.next_look(12 * TIMEOUT)
+    case.judge.next_look(12 * TIMEOUT)
     assert case.stops.after == [12]
     case.words.cells[Word.BEAT_NS] = 13 * TIMEOUT
-    case.judge.wait_ms(14 * TIMEOUT)
+    case.judge.next_look(14 * TIMEOUT)
     assert case.stops.after == [12, 12]
 
 
 def test_life_before_the_latch_is_no_reason_to_send() -> None:
     case = Case(beat=1000)
-    case.judge.wait_ms(2000)
+    case.judge.next_look(2000)
     case.words.cells[Word.BEAT_NS] = 3000
-    case.judge.wait_ms(4000)
+    case.judge.next_look(4000)
     assert case.stops.after == []
 
 
@@ -161,21 +170,54 @@ class Ending(Stops):
         os.close(self._theirs)
 
 
+@contextmanager
+def held(words: Words) -> Iterator[None]:
+    """A loop's thread that holds the lock while the block runs."""
+    holds, ends = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        words.lifeline.hold()
+        holds.set()
+        ends.wait()
+
+    thread = threading.Thread(target=hold)
+    thread.start()
+    holds.wait()
+    try:
+        yield
+    finally:
+        ends.set()
+        thread.join()
+
+
 @pytest.mark.parametrize("armed", [0, 1])
 def test_watching_ends_with_the_controller(armed: int) -> None:
+    """The second sign alone: the lock is still held."""
     case, controller = Case(armed=armed, beat=time.monotonic_ns()), Ending(0)
     controller.end()
-    watch(case.words, controller.ours, TIMEOUT, controller)
+    with held(case.words):
+        watch(case.words, controller.ours, TIMEOUT, controller)
     os.close(controller.ours)
     assert controller.after == [7] * (STOPS * armed) and case.fired == armed
     assert abs(time.monotonic_ns() - case.words.cells[Word.GUARD_NS]) < 4_000_000_000
+
+
+@pytest.mark.parametrize("armed", [0, 1])
+def test_watching_ends_when_the_loop_gives_up_its_lock(armed: int) -> None:
+    """Handed on at the end of a run; while armed that is an end without stop frames."""
+    case, controller = Case(armed=armed, beat=time.monotonic_ns()), Ending(0)
+    watch(case.words, controller.ours, 60_000_000_000, controller)  # nobody holds it
+    controller.end()
+    os.close(controller.ours)
+    assert controller.after == [7] * (STOPS * armed) and case.fired == armed
 
 
 @pytest.mark.timeout(10)
 def test_watching_fires_when_the_heart_stops_and_goes_on() -> None:
     begun = time.monotonic_ns()
     case, controller = Case(beat=begun), Ending(STOPS)
-    watch(case.words, controller.ours, TIMEOUT, controller)
+    with held(case.words):
+        watch(case.words, controller.ours, TIMEOUT, controller)
     os.close(controller.ours)
     assert controller.after == [7] * STOPS and time.monotonic_ns() - begun >= TIMEOUT
 
