@@ -8,14 +8,12 @@ import math
 import os
 import platform
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,7 @@ from hil.config import RunConfig, load_toml
 from hil.design import Machine, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Rights, Words, guardian
+from hil.log.origin import origin, package_version
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.log.split import part_path
 from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
@@ -242,31 +241,9 @@ def log_path(setup: Setup, kind: str) -> Path:
     return path if log.split_s is None and log.split_mb is None else part_path(path, 0)
 
 
-def _git_commit() -> str:
-    try:
-        return subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            timeout=5,
-            check=True,
-        ).stdout.strip()
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
-
-
-def package_version(name: str) -> str:
-    """Version of an installed package."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "not installed"
-
-
 def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
     """Metadata and attachments that make a log self-contained."""
-    packages = ("hil-drive", "numpy", "scipy", "numba", "python-can", "mcap")
+    packages = ("numpy", "scipy", "numba", "python-can", "mcap")
     attachments = {
         "config.toml": setup.path.read_text(encoding="utf-8"),
         "config.json": setup.config.model_dump_json(),
@@ -282,7 +259,6 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
             "kind": kind,
             "clock": clock,
             "started": datetime.now(UTC).isoformat(),
-            "commit": _git_commit(),
             "python": sys.version.split()[0],
             "machine": platform.machine(),
             "kernel": platform.release(),
@@ -296,6 +272,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
                     **({"T_L_top": setup.wire.T_L_top} if math.isfinite(setup.wire.T_L_top) else {}),
                 }
             ),
+            **origin(),
             **{f"version {name}": package_version(name) for name in packages},
         },
         "attachments": attachments,

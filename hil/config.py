@@ -72,10 +72,12 @@ def included(value: Any, info: ValidationInfo) -> Any:
     return info.context["include"](value) if isinstance(value, str) and info.context else value
 
 
-def _includer(base: Path) -> Callable[[str], dict[str, Any]]:
-    """Return what reads a TOML file relative to ``base``."""
+def _includer(base: Path | None) -> Callable[[str], dict[str, Any]]:
+    """Return what reads a TOML file relative to ``base``; without one no file is opened."""
 
     def include(name: str) -> dict[str, Any]:
+        if base is None:
+            raise ValueError("must be a table: a config inside a log opens no file")
         try:
             return read_toml(base / name)
         except ConfigError as error:
@@ -414,8 +416,8 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
     return validate(data, model, str(path), path.parent)
 
 
-def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path) -> Model:
-    """Validate ``data`` as ``model``; ``base`` is the folder that paths are relative to."""
+def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path | None) -> Model:
+    """Validate ``data`` as ``model``; paths in it are relative to ``base``, and refused without one."""
     try:
         return model.model_validate(data, context={"include": _includer(base)})
     except ValidationError as error:

@@ -18,6 +18,7 @@ from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_la
 from hil.control.references import reference
 from hil.guard import SAFETY_PARAMS
 from hil.kernel import PLACED, new_safety_state, prepare, step, whole, whole_at
+from hil.log.named import to_named
 from hil.signals import TickArray, new_ticks
 
 CYCLIC_ECHO_LAG = 3
@@ -80,37 +81,15 @@ class Machine:
         return Machine(self.safety, new_safety_state(), self.law, new_law_state(), self.reference)
 
     def to_json(self) -> str:
-        """The parameters bit by bit: the design's exponentials differ in the last bits between CPUs."""
-        return json.dumps({"safety": self.safety.tobytes().hex(), "law": self.law.tobytes().hex()})
-
-    def with_parameters(self, text: str) -> Machine:
-        """This controller with the parameters of :meth:`to_json`. Raises ValueError for others than its own.
-
-        They may differ from this machine's design by rounding alone (1e-9 relative).
-        """
-        given = json.loads(text)
-        safety, law = (
-            _record(given[name], own) for name, own in (("safety", self.safety), ("law", self.law))
-        )
-        return Machine(safety, self.safety_state, law, self.law_state, self.reference)
+        """The parameters by name, exact to the bit: a design's exponentials differ between processors."""
+        records = {"safety": self.safety, "law": self.law, "reference": self.reference}
+        return json.dumps({name: to_named(record) for name, record in records.items()})
 
     def warm_up(self) -> None:
         """Compile every kernel on copies, before anything is armed."""
         other, ticks = self.fresh(), new_ticks()
         other.prepare(ticks)
         other.step(ticks)
-
-
-def _record(text: str, own: Record) -> Record:
-    """A record from hex, which must be ``own`` up to rounding."""
-    raw = bytes.fromhex(text)
-    if len(raw) != own.nbytes:
-        raise ValueError("the parameters are another version's")
-    record = np.frombuffer(raw, own.dtype).copy()
-    for name in own.dtype.names or ():
-        if not np.allclose(record[name], own[name], rtol=1e-9, atol=0, equal_nan=True):
-            raise ValueError(f"the design of {name} is not the one that wrote the log")
-    return record
 
 
 def motor_model(table: MotorTable) -> MotorModel:

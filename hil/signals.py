@@ -217,9 +217,9 @@ FIELDS: Final[tuple[Field, ...]] = (
 )
 
 
-def _tag(field: Field) -> bytes:
+def tag(number: int, kind: Kind) -> bytes:
     """Protobuf tag of a field: varint of (number << 3 | wire type)."""
-    value = field.number << 3 | _WIRE_TYPE[field.kind]
+    value = number << 3 | _WIRE_TYPE[kind]
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)
@@ -232,7 +232,10 @@ def _dtype() -> np.dtype[np.void]:
     """Packed layout: for each field its tag bytes, then its little-endian value."""
     parts: list[tuple[str, str]] = []
     for field in FIELDS:
-        parts += [(f"_{field.number}", f"S{len(_tag(field))}"), (field.name, f"<{field.kind}")]
+        parts += [
+            (f"_{field.number}", f"S{len(tag(field.number, field.kind))}"),
+            (field.name, f"<{field.kind}"),
+        ]
     return np.dtype(parts)
 
 
@@ -245,7 +248,7 @@ def new_ticks(count: int = 1) -> TickArray:
     """Return ``count`` zeroed tick records with their protobuf tags in place."""
     ticks = np.zeros(count, TICK)
     for field in FIELDS:
-        ticks[f"_{field.number}"] = _tag(field)
+        ticks[f"_{field.number}"] = tag(field.number, field.kind)
     for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
         ticks[name] = np.nan
     return ticks

@@ -85,7 +85,7 @@ def verdict_text(replay: dict[str, Any]) -> str:
             f" from tick {first['tick']} on: {first['field']} logged {first['logged']}, "
             f"replayed {first['replayed']} ({first['ulp']} ulp)"
         )
-    return text + (f"; {replay['why']}" if replay["why"] else "")
+    return "; ".join([text, *([replay["why"]] if replay["why"] else []), *replay.get("notes", ())])
 
 
 def run_table(result: RunResult) -> Table:

@@ -21,6 +21,7 @@ from hil.control.law import FAC
 from hil.design import Machine, build
 from hil.errors import HilError
 from hil.log.mcapfile import RunFile
+from hil.log.origin import origin
 from hil.log.reader import Log, LogError, Source, new_log
 from hil.log.recorder import check_folder
 from hil.log.split import STATE
@@ -131,7 +132,7 @@ def header(log: Log, config: Path, machine: Machine, used: RunConfig) -> dict[st
     }
     if STATE in log.attachments:  # a part of a run: the new controller begins with it, whatever its number
         new[STATE] = state_text(machine, json.loads(log.attachments[STATE])["k"])
-    run = log.metadata.get("run", {}) | {"kind": "what-if", "of": log.path.name}
+    run = log.metadata.get("run", {}) | origin() | {"kind": "what-if", "of": log.path.name}
     return {"metadata": run, "attachments": log.attachments | new}
 
 

@@ -25,7 +25,7 @@ from mcap.records import (
 
 from hil.log.container import MAGIC
 from hil.log.errors import DamagedError, LogError
-from hil.log.reader import Log, read_blocks
+from hil.log.reader import Log, check_format, read_blocks
 from hil.log.scan import MAX_RECORD, parse, read_record
 from hil.signals import new_ticks
 
@@ -53,10 +53,23 @@ class Info:
     attachments: dict[str, int] = field(default_factory=dict)
     damage: str | None = None
 
+    @property
+    def format(self) -> int:
+        """The log's format; one without a number is of the first."""
+        return int(self.metadata.get("run", {}).get("format", "1"))
+
+    @property
+    def written_by(self) -> str:
+        """Version and commit of the writer."""
+        run = self.metadata.get("run", {})
+        return f"hil-drive {run.get('version hil-drive', 'unknown')}, {run.get('commit', 'unknown')}"
+
     def as_dict(self) -> dict[str, Any]:
         """JSON form."""
         return {
             "log": str(self.path),
+            "format": self.format,
+            "written_by": self.written_by,
             "bytes": self.size,
             "counts": self.counts,
             "start_ns": self.start_ns,
@@ -126,6 +139,7 @@ def _from_summary(path: Path, stream: IO[bytes]) -> Info:
     out.counts = {topic: counts.get(number, 0) for number, topic in topics.items()}
     if "run" not in out.metadata:
         raise LogError(f"{path}: is no log of hil (it has no run metadata)")
+    check_format(path, out.metadata["run"])
     return out
 
 

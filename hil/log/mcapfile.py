@@ -29,21 +29,31 @@ from hil.log.schema import (
     pack_stats,
     units,
 )
-from hil.signals import TICK, TickArray
+from hil.log.ticks import OWN, form_of, logged_as
+from hil.signals import TickArray
 
 Column = npt.NDArray[Any] | int
 
 CHUNK_BYTES: Final = 256 * 1024
 MESSAGE: Final = 5
 HEAD: Final = np.dtype(MESSAGE_HEAD)
-TICK_MESSAGE: Final = np.dtype([*MESSAGE_HEAD, ("data", f"V{TICK.itemsize}")])
+TICK_MESSAGE: Final = form_of(OWN).message
 _FRAME_MESSAGE: Final = np.dtype([*MESSAGE_HEAD, ("data", FRAME_MESSAGE)])
 
 
 class RunFile:
     """A run's file. Raises OSError when it can't be written; what was written before stays readable."""
 
-    def __init__(self, path: Path, header: dict[str, Any], chunk_bytes: int = CHUNK_BYTES) -> None:
+    def __init__(
+        self,
+        path: Path,
+        header: dict[str, Any],
+        chunk_bytes: int = CHUNK_BYTES,
+        absent: frozenset[str] = frozenset(),
+    ) -> None:
+        """``absent``: fields that the ticks to come do not have, since an older log is copied."""
+        self._absent = absent
+        self._form = form_of([row for row in OWN if row[1] not in absent])
         self._out = Container(path)
         self._limit = chunk_bytes
         self._ticks, self._others = Block(), Block()
@@ -56,7 +66,7 @@ class RunFile:
 
     def _open(self, header: dict[str, Any]) -> None:
         """Schemas and channels, then metadata ``run``, ``units``, ``meanings`` and the run's attachments."""
-        descriptors = file_descriptor_set().SerializeToString()
+        descriptors = file_descriptor_set(self._absent).SerializeToString()
         schemas = {name: self._out.add_schema(name, descriptors) for name in sorted(set(TOPICS.values()))}
         self._channels = {
             topic: self._out.add_channel(topic, schemas[name]) for topic, name in TOPICS.items()
@@ -78,19 +88,20 @@ class RunFile:
 
     def add_ticks(self, ticks: TickArray) -> None:
         """Append tick records (any number)."""
-        per_chunk = max(1, self._limit // TICK_MESSAGE.itemsize)
+        per_chunk = max(1, self._limit // self._form.message.itemsize)
         for at in range(0, len(ticks), per_chunk):
             self._add_ticks(ticks[at : at + per_chunk])
         self.ticks += len(ticks)
 
     def _add_ticks(self, ticks: TickArray) -> None:
-        messages = np.empty(len(ticks), TICK_MESSAGE)
+        layout, message = self._form.layout, self._form.message
+        messages = np.empty(len(ticks), message)
         self._head(messages, self._channels["/tick"], ticks["t_ns"], ticks["k"] & 0xFFFFFFFF)
-        messages["length"] = FIXED_BYTES + TICK.itemsize
-        messages["data"] = np.ascontiguousarray(ticks).view(f"V{TICK.itemsize}")
-        lengths = np.full(len(ticks), TICK_MESSAGE.itemsize, np.int64)
+        messages["length"] = FIXED_BYTES + layout.itemsize
+        messages["data"] = logged_as(ticks, self._form).view(f"V{layout.itemsize}")
+        lengths = np.full(len(ticks), message.itemsize, np.int64)
         self._ticks.add(messages["channel"].astype(np.int64), ticks["t_ns"], lengths, messages.tobytes())
-        if self._ticks.size + TICK_MESSAGE.itemsize > self._limit:
+        if self._ticks.size + message.itemsize > self._limit:
             self._ticks = self._close(self._ticks)
 
     @staticmethod

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -20,7 +20,8 @@ from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, S
 
 from hil.log.container import FIXED_BYTES, LIBRARY
 from hil.log.errors import DamagedError, LogError
-from hil.log.mcapfile import MESSAGE, TICK_MESSAGE
+from hil.log.layouts import FORMAT
+from hil.log.mcapfile import MESSAGE
 from hil.log.scan import Raw, chunk_content, chunk_rows, parse, parse_attachment, raw_records
 from hil.log.schema import (
     FRAME_HEAD,
@@ -32,24 +33,18 @@ from hil.log.schema import (
     message_layout,
     unpack_event,
 )
-from hil.signals import FIELDS, TICK, TickArray, new_ticks
+from hil.log.ticks import Ticks, form_of, without
+from hil.signals import TICK, TickArray, new_ticks
 
 __all__ = ["Frame", "Log", "LogError", "Source", "new_log", "open_log", "read_blocks"]
 
 Rows = npt.NDArray[np.int64]
+_OWN: Final = file_descriptor_set().SerializeToString()
 Source = Path | Sequence[Path]
 """A log: one file, or the parts of a split run in order."""
 MEMORY_SHARE: Final = 0.5
 SLAB_TICKS: Final = 1 << 17  # 48 MB, above the size up to which malloc keeps freed memory
 _WHOLE: Final = np.dtype(f"V{TICK.itemsize}")  # copied at once, where TICK is copied field by field
-_TAG_BYTES: Final = np.concatenate(
-    [
-        np.arange(at, at + kind.itemsize)
-        for name, (kind, at, *_) in (TICK.fields or {}).items()
-        if name[0] == "_"
-    ]
-)
-_TAGS: Final = new_ticks(1).view(np.uint8)[_TAG_BYTES]
 FRAME_OBJECT_RATIO: Final = 4  # a Frame object over its 78-byte record
 
 
@@ -85,6 +80,10 @@ class Log:
     last_t_ns: int | None = None
     parts: tuple[Path, ...] = ()
     """The files of a run that was split, in order; none for a run in one file."""
+    absent: frozenset[str] = frozenset()
+    """Fields of today's ticks that the log lacks; what stands in their place was not logged."""
+    unknown: tuple[str, ...] = ()
+    """Fields of its ticks that this version does not know and passes by."""
 
     @property
     def result(self) -> dict[str, Any]:
@@ -102,12 +101,8 @@ class Log:
         """Nothing is held open; the block only shows how long the log is used."""
 
     def to_numpy(self) -> TickArray:
-        """The ticks as a plain structured array: the named fields alone, exact."""
-        names = [field.name for field in FIELDS]
-        out = np.empty(len(self.ticks), [(name, self.ticks.dtype[name]) for name in names])
-        for name in names:
-            out[name] = self.ticks[name]
-        return out
+        """The ticks as a plain structured array: the named fields that the log has, exact."""
+        return without(self.ticks, self.absent)
 
     def to_pandas(self, *, names: bool = False) -> Any:
         """The ticks as a DataFrame indexed by the time since the first [s]; units in ``df.attrs["units"]``.
@@ -139,6 +134,7 @@ class _Pass:
         self._topics: dict[int, str] = {}
         self._named: dict[int, str] = {}
         self._tick_channel = -1
+        self._form: Ticks | None = None
         self.ours = self.complete = False
         self.problems: list[str] = []
         self._messages_seen = 0
@@ -168,6 +164,8 @@ class _Pass:
             self._channel(record)
         elif isinstance(record, Metadata):
             self.log.metadata[record.name] = dict(record.metadata)
+            if record.name == "run":
+                check_format(self.log.path, record.metadata)
         elif isinstance(record, Statistics):
             self._compare(record.message_count)
         elif isinstance(record, Footer):
@@ -191,12 +189,24 @@ class _Pass:
             raise LogError(
                 f"{self.log.path}: topic {channel.topic} has not the schema {name}; not a log of hil"
             )
-        own = file_descriptor_set().SerializeToString()
-        if name != "hil.Stats" and message_layout(schema.data, name) != message_layout(own, name):
-            raise LogError(f"{self.log.path}: {name} has another layout; written by another version of hil")
-        self._topics[channel.id] = channel.topic
         if channel.topic == "/tick":
-            self._tick_channel = channel.id
+            self._learn(schema, channel.id)
+        elif name != "hil.Stats" and message_layout(schema.data, name) != message_layout(_OWN, name):
+            raise LogError(
+                f"{self.log.path}: {name} has another layout than format {FORMAT}; not a log of hil"
+            )
+        self._topics[channel.id] = channel.topic
+
+    def _learn(self, schema: Schema, channel: int) -> None:
+        """How this file's ticks are laid out."""
+        try:
+            form = form_of(message_layout(schema.data, "hil.Tick") or [])
+        except LogError as error:
+            raise LogError(f"{self.log.path}: {error}; another version's log, or none of hil") from error
+        if self._form is not None and self._form.form.shape != form.shape:
+            raise LogError(f"{self.log.path}: has two channels of ticks that differ; not a log of hil")
+        self._form, self._tick_channel = Ticks(form), channel
+        self.log.absent, self.log.unknown = form.absent, form.unknown
 
     def _chunk(self, data: bytes) -> Iterator[Block]:
         ticks = self._uniform(data)
@@ -227,24 +237,39 @@ class _Pass:
 
     def _uniform(self, data: bytes) -> TickArray | None:
         """The ticks of a chunk that holds nothing else, as this program writes it; None for any other."""
-        if not data or len(data) % TICK_MESSAGE.itemsize:
+        if self._form is None or not data or len(data) % self._form.form.message.itemsize:
             return None
-        messages = np.frombuffer(data, TICK_MESSAGE)
+        layout = self._form.form.layout
+        messages = np.frombuffer(data, self._form.form.message)
         same = (messages["opcode"] == MESSAGE) & (messages["channel"] == self._tick_channel)
-        if not (same & (messages["length"] == FIXED_BYTES + TICK.itemsize)).all():
+        if not (same & (messages["length"] == FIXED_BYTES + layout.itemsize)).all():
             return None
-        return np.ascontiguousarray(messages["data"]).view(TICK)
+        records = np.ascontiguousarray(messages["data"]).view(layout)
+        return self._form.today(records) if self._form.fits(records) else None
 
     def _messages(self, topic: str, data: bytes, rows: Rows) -> Iterator[Block]:
         """The messages of one channel of a chunk."""
         starts, lengths = rows[:, 1] + FIXED_BYTES, rows[:, 2] - FIXED_BYTES
         if topic == "/tick":
-            if (lengths != TICK.itemsize).any():
-                raise LogError(f"{self.log.path}: tick records of another length than {TICK.itemsize} bytes")
-            yield self._ticks(_gather(data, starts, TICK))
+            yield self._ticks(self._ticks_at(data, starts, lengths))
         elif topic == "/event":
             for start, length in zip(starts.tolist(), lengths.tolist(), strict=True):
                 self._event(data[start : start + length])
+
+    def _ticks_at(self, data: bytes, starts: Rows, lengths: Rows) -> TickArray:
+        assert self._form is not None  # noqa: S101 - the topic is known by its channel alone
+        if (lengths == self._form.form.layout.itemsize).all():
+            records = _gather(data, starts, self._form.form.layout)
+            if self._form.fits(records):
+                return self._form.today(records)
+        ends = zip(starts.tolist(), (starts + lengths).tolist(), strict=True)
+        try:
+            return self._form.spelled([data[start:end] for start, end in ends])
+        except DamagedError as error:
+            if (lengths == self._form.form.layout.itemsize).all():
+                raise
+            size = self._form.form.layout.itemsize
+            raise LogError(f"{self.log.path}: tick records of another length than {size} bytes") from error
 
     def _frames(self, data: bytes, rows: Rows, received: npt.NDArray[np.bool_]) -> Block:
         """The frames of a chunk, both ways, in the order in which they passed the loop."""
@@ -265,10 +290,7 @@ class _Pass:
         self.log.events.append({"t_ns": t_ns, "k": k, "kind": kind, "text": text})
 
     def _ticks(self, ticks: TickArray) -> Block:
-        """Count ticks; their tags must be those of the layout, or every value would be another's."""
-        raw = ticks.view(np.uint8).reshape(len(ticks), TICK.itemsize)
-        if (raw[:, _TAG_BYTES] != _TAGS).any():
-            raise DamagedError("tick records whose tags do not fit")
+        """Count ticks."""
         self.log.tick_count += len(ticks)
         self.log.last_t_ns = int(ticks["t_ns"][-1])
         return Block("ticks", ticks)
@@ -279,6 +301,17 @@ def _gather(data: bytes, starts: Rows, dtype: np.dtype[np.void]) -> Records:
     padded = np.frombuffer(data + bytes(dtype.itemsize), np.uint8)
     index = starts[:, None] + np.arange(dtype.itemsize)[None, :]
     return np.ascontiguousarray(padded[index]).view(dtype)[:, 0]
+
+
+def check_format(path: Path, run: Mapping[str, str]) -> None:
+    """Refuse a log of a later format than this version knows. Raises LogError."""
+    number = run.get("format", "1")
+    if not number.isdecimal() or not 1 <= int(number[:9]) <= FORMAT:
+        by = f"hil-drive {run.get('version hil-drive', 'unknown')}"
+        raise LogError(
+            f"{path}: is of format {number:.20}, written by {by:.60}; this version reads 1 to {FORMAT}; "
+            "take a later one"
+        )
 
 
 def read_blocks(log: Log) -> Iterator[Block]:
@@ -297,6 +330,7 @@ def _read_parts(log: Log) -> Iterator[Block]:
         if number == 0:
             part.metadata, part.attachments = log.metadata, log.attachments
         for block in _read_file(part):
+            log.absent, log.unknown = log.absent | part.absent, part.unknown
             log.last_t_ns = part.last_t_ns if part.last_t_ns is not None else log.last_t_ns
             log.tick_count += len(block.records) if block.kind == "ticks" else 0
             yield block

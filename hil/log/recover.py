@@ -51,7 +51,7 @@ def recover(path: Path, out: Path) -> Recovery:
 
 def _begin(log: Log, out: Path) -> RunFile:
     run = log.metadata.get("run", {})
-    file = RunFile(out, {"metadata": run, "attachments": log.attachments})
+    file = RunFile(out, {"metadata": run, "attachments": log.attachments}, absent=log.absent)
     if "part" in log.metadata:
         file.add_metadata("part", log.metadata["part"])
     file.add_metadata("recovered", {"from": log.path.name, "damage": log.damage or "none"})

@@ -8,7 +8,7 @@ Units and meanings of the fields go to the file's metadata, since a descriptor c
 from __future__ import annotations
 
 import struct
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,7 @@ FRAME_MESSAGE: Final = np.dtype(
 FRAME_HEAD: Final = FRAME_MESSAGE.itemsize - 64
 FRAME_TAGS: Final = (("_1", 0x09), ("_2", 0x15), ("_3", 0x1A))
 
-_TYPES: Final = {
+TYPES: Final[dict[str, Any]] = {
     "f8": FieldDescriptorProto.TYPE_DOUBLE,
     "u8": FieldDescriptorProto.TYPE_FIXED64,
     "i8": FieldDescriptorProto.TYPE_SFIXED64,
@@ -61,16 +61,17 @@ _OTHERS: Final = {
 }
 
 
-def file_descriptor_set() -> FileDescriptorSet:
-    """All messages of package ``hil``."""
+def file_descriptor_set(absent: frozenset[str] = frozenset()) -> FileDescriptorSet:
+    """All messages of package ``hil``; a tick without the fields that are ``absent``."""
     file = FileDescriptorProto(name="hil.proto", package="hil", syntax="proto3")
     tick = file.message_type.add(name="Tick")
     for field in FIELDS:
-        tick.field.add(name=field.name, number=field.number, type=_TYPES[field.kind], label=1)
+        if field.name not in absent:
+            tick.field.add(name=field.name, number=field.number, type=TYPES[field.kind], label=1)
     for name, fields in _OTHERS.items():
         message = file.message_type.add(name=name)
         for number, (field_name, kind) in enumerate(fields, start=1):
-            message.field.add(name=field_name, number=number, type=_TYPES[kind], label=1)
+            message.field.add(name=field_name, number=number, type=TYPES[kind], label=1)
     return FileDescriptorSet(file=[file])
 
 

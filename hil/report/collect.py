@@ -72,7 +72,7 @@ class Run:
         """The log's own config and design; what is unusable is said in the report."""
         try:
             data = json.loads(self.log.attachments["config.json"])
-            self.config = validate(data, RunConfig, "config.json", self.log.path.parent)
+            self.config = validate(data, RunConfig, "config.json", None)
             machine: Machine = machine_of(self.log)
         except (KeyError, ValueError, TypeError, RecursionError) as error:
             self.config_problem = f"the log has no usable config ({error!r})"

@@ -4,18 +4,36 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import struct
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
 
 from hil.control.law import LAW_NEUTRAL, LAW_PARAMS, LAW_STATE
 from hil.control.references import REFERENCE, REFERENCE_NEUTRAL
 from hil.guard import SAFETY_NEUTRAL, SAFETY_PARAMS, SAFETY_STATE
+from hil.log.container import Block, Container
+from hil.log.info import info
 from hil.log.layouts import FORMAT_1, TICK_FIELDS_1
+from hil.log.mcapfile import RunFile
 from hil.log.named import fill, read_named, to_named
-from hil.signals import FIELDS
+from hil.log.reader import Log, LogError, open_log
+from hil.log.recover import recover
+from hil.log.schema import TYPES, file_descriptor_set
+from hil.replay import replay_log
+from hil.signals import FIELDS, TickArray, tag
+from hil.view import verdict_text
+from tests.golden.kept import LOGS
+from tests.logfiles import some_ticks
+
+GOLDEN = LOGS / "1a4c819"
 
 RECORDS = {
     "safety": (SAFETY_PARAMS, SAFETY_NEUTRAL),
@@ -107,3 +125,149 @@ def test_what_is_no_record_is_refused(given: Any, words: str) -> None:
     none: Mapping[str, float] = {}
     with pytest.raises(ValueError, match=words):
         fill(np.zeros(1, layout), read_named("safety", given), none)
+
+
+def other_version(path: Path, ticks: TickArray, *, lacks: tuple[str, ...], has: tuple[Any, ...]) -> Path:
+    """A log of a version that lacks some of today's fields and has others, by Container alone."""
+    fields = [(f.number, f.name, f.kind, ticks[f.name]) for f in FIELDS if f.name not in lacks]
+    fields += [(number, name, kind, np.full(len(ticks), value)) for number, name, kind, value in has]
+    fields.sort(key=lambda row: row[0])
+    file = FileDescriptorProto(name="hil.proto", package="hil", syntax="proto3")
+    message = file.message_type.add(name="Tick")
+    parts: list[tuple[str, str]] = []
+    for number, name, kind, _ in fields:
+        message.field.add(name=name, number=number, type=TYPES[kind], label=1)
+        parts += [(f"_{number}", f"S{len(tag(number, kind))}"), (f"v{number}", f"<{kind}")]
+    records = np.empty(len(ticks), parts)
+    for number, _, kind, values in fields:
+        records[f"_{number}"], records[f"v{number}"] = tag(number, kind), values
+    out = Container(path)
+    schema = out.add_schema("hil.Tick", FileDescriptorSet(file=[file]).SerializeToString())
+    channel = out.add_channel("/tick", schema)
+    out.add_metadata("run", {"format": "2"})
+    block, size = Block(), records.itemsize
+    for row, record in enumerate(records):
+        raw = (
+            struct.pack("<BQHIQQ", 5, 22 + size, channel, row, int(ticks["t_ns"][row]), 0) + record.tobytes()
+        )
+        one = np.array([1], np.int64)
+        block.add(one * channel, ticks["t_ns"][row : row + 1].astype(np.int64), one * len(raw), raw)
+    out.add_chunk(block)
+    out.finish()
+    return path
+
+
+def test_fields_that_are_not_known_are_skipped_and_those_lacking_are_absent(tmp_path: Path) -> None:
+    ticks = some_ticks(50)
+    lacks = ("T_L_hat", "filled", "lateness_ns")
+    has = ((15, "older", "u4", 7), (900, "newer", "f8", 1.5))
+    log = open_log(other_version(tmp_path / "a.mcap", ticks, lacks=lacks, has=has))
+    assert log.damage is None and log.absent == set(lacks) and log.unknown == ("older", "newer")
+    assert all(np.isnan(log.ticks["T_L_hat"])) and not log.ticks["filled"].any()
+    for field in FIELDS:
+        if field.name not in lacks:
+            assert log.ticks[field.name].tobytes() == ticks[field.name].tobytes(), field.name
+    assert set(log.to_numpy().dtype.names or ()) == {f.name for f in FIELDS} - set(lacks)
+
+
+def test_what_is_absent_stays_absent_in_a_recovered_log(tmp_path: Path) -> None:
+    first = other_version(tmp_path / "a.mcap", some_ticks(50), lacks=("T_L_hat",), has=())
+    recover(first, tmp_path / "b.mcap")
+    again = open_log(tmp_path / "b.mcap")
+    assert again.absent == {"T_L_hat"} and again.ticks.tobytes() == open_log(first).ticks.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("lacks", "has", "words"),
+    [
+        (("i_q",), (), "lack i_q"),
+        (("w",), ((18, "speed", "f8", 1.0),), "field 18 of a tick is speed"),
+        (("w",), ((18, "w", "i8", 1),), "field 18 of a tick is w of type"),
+        ((), ((900, "w", "f8", 1.0),), "one number or name"),
+    ],
+)
+def test_fields_of_another_meaning_are_refused(
+    tmp_path: Path, lacks: tuple[str, ...], has: tuple[Any, ...], words: str
+) -> None:
+    path = other_version(tmp_path / "a.mcap", some_ticks(5), lacks=lacks, has=has)
+    with pytest.raises(LogError, match=words):
+        open_log(path)
+
+
+def test_ticks_that_another_program_encoded_anew_are_read(tmp_path: Path) -> None:
+    """proto3 leaves zeros out, so that the messages are of many lengths."""
+    ticks, path = some_ticks(40), tmp_path / "a.mcap"
+    ticks["guard_flags"][::2] = 0
+    ticks["i_d"][::3] = 0.0
+    pool = DescriptorPool()
+    for file in file_descriptor_set().file:
+        pool.Add(file)
+    Tick = GetMessageClass(pool.FindMessageTypeByName("hil.Tick"))
+    out = Container(path)
+    channel = out.add_channel("/tick", out.add_schema("hil.Tick", file_descriptor_set().SerializeToString()))
+    out.add_metadata("run", {})
+    block, one = Block(), np.array([1], np.int64)
+    for tick in ticks:
+        data = Tick(**{f.name: tick[f.name].item() for f in FIELDS}).SerializeToString()
+        raw = struct.pack("<BQHIQQ", 5, 22 + len(data), channel, 0, int(tick["t_ns"]), 0) + data
+        block.add(one * channel, one * int(tick["t_ns"]), one * len(raw), raw)
+    out.add_chunk(block)
+    out.finish()
+    log = open_log(path)
+    assert log.damage is None and log.ticks.tobytes() == ticks.tobytes()
+
+
+@pytest.mark.parametrize("number", ["3", "99999999999999999999", "0", "-1", "two", ""])
+def test_a_later_format_is_refused_in_one_line(tmp_path: Path, number: str) -> None:
+    path = tmp_path / "a.mcap"
+    run = {"format": number, "version hil-drive": "9.9"}
+    with RunFile(path, {"metadata": run}) as file:
+        file.add_ticks(some_ticks(5))
+        file.finish({})
+    for read in (open_log, info):
+        with pytest.raises(LogError, match=r"format .*written by hil-drive 9\.9.*reads 1 to 2") as refused:
+            read(path)
+        assert "\n" not in str(refused.value)
+
+
+def changed_log(log: Log, name: str, text: str) -> Log:
+    """The same log with another attachment, as one of another version."""
+    log.attachments[name] = text
+    log.metadata["run"]["version hil-drive"] = "another"
+    return log
+
+
+def test_a_parameter_that_a_log_lacks_is_named_in_the_verdict(monkeypatch: pytest.MonkeyPatch) -> None:
+    log = open_log(GOLDEN / "simulate.mcap")
+    given = json.loads(log.attachments["controller.json"])
+    safety = read_named("safety", given["safety"])
+    record = np.zeros(1, FORMAT_1["safety"])
+    fill(record, safety, {})
+    named = to_named(record)
+    del named["open_phase_min"]
+    monkeypatch.setitem(SAFETY_NEUTRAL, "open_phase_min", math.inf)
+    verdict = replay_log(changed_log(log, "controller.json", json.dumps(given | {"safety": named})))
+    assert verdict.verdict == "same"
+    assert verdict.notes == ("the log lacks safety.open_phase_min, taken as inf",)
+    assert verdict.as_dict()["notes"] == list(verdict.notes)
+    assert "open_phase_min, taken as inf" in verdict_text(verdict.as_dict())
+
+
+def test_parameters_in_the_log_stand_against_another_design() -> None:
+    log = open_log(GOLDEN / "simulate.mcap")
+    config = json.loads(log.attachments["config.json"])
+    config["limits"]["w_max_rad_s"] += 1.0
+    verdict = replay_log(changed_log(log, "config.json", json.dumps(config)))
+    assert verdict.verdict == "same" and "would design w_max otherwise" in verdict.notes[0]
+    config["limits"]["not there any more"] = 1.0
+    verdict = replay_log(changed_log(log, "config.json", json.dumps(config)))
+    assert verdict.verdict == "same" and "does not take the config" in verdict.notes[0]
+
+
+def test_a_config_inside_a_log_opens_no_path(tmp_path: Path) -> None:
+    fifo = tmp_path / "motor.toml"
+    os.mkfifo(fifo)
+    log = open_log(GOLDEN / "simulate.mcap")
+    config = json.loads(log.attachments["config.json"]) | {"motor": str(fifo)}
+    verdict = replay_log(changed_log(log, "config.json", json.dumps(config)))
+    assert any("opens no file" in note for note in verdict.notes)

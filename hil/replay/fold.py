@@ -1,0 +1,72 @@
+"""The controller folded over logged ticks, and the outputs compared by bits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.control.jit import jit
+from hil.design import Machine
+from hil.kernel import step
+from hil.replay.verdict import Difference
+from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
+
+_KINDS = {field.name: field.kind for field in FIELDS}
+
+
+@jit
+def fold(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
+    """Run the controller over ticks whose inputs are set, in place."""
+    for j in range(ticks.shape[0]):
+        step(sp, ss, lp, ls, ticks[j : j + 1])
+
+
+def set_inputs(ticks: TickArray, logged: TickArray) -> None:
+    """Copy times and inputs of the logged ticks; every output is left to be computed."""
+    for field in FIELDS:
+        if field.role == "time" or field.name in INPUTS:
+            ticks[field.name] = logged[field.name]
+
+
+def refold(machine: Machine, logged: TickArray) -> TickArray:
+    """The ticks with every output computed anew; ``machine`` keeps its state for the ticks that follow."""
+    ticks = new_ticks(len(logged))
+    set_inputs(ticks, logged)
+    fold(machine.safety, machine.safety_state, machine.law, machine.law_state, ticks)
+    return ticks
+
+
+def replayed(machine: Machine, logged: TickArray) -> TickArray:
+    """A whole run computed anew from its first tick on."""
+    return refold(machine.fresh(), logged)
+
+
+def bits(values: npt.NDArray[Any], kind: str) -> npt.NDArray[np.int64]:
+    """Bit patterns as integers, ordered so that neighbouring floats differ by 1."""
+    raw = np.ascontiguousarray(values)
+    if kind != "f8":
+        return raw.astype(np.int64)
+    pattern = raw.view(np.int64)
+    return np.where(pattern < 0, np.int64(-(2**63)) - pattern, pattern)
+
+
+def compare(logged: TickArray, again: TickArray, absent: frozenset[str] = frozenset()) -> Difference | None:
+    """The first tick and field whose bits differ; what the log lacks is not compared."""
+    if logged.tobytes() == again.tobytes():
+        return None
+    first: tuple[int, str] | None = None
+    for name in OUTPUTS:
+        if name in absent:
+            continue
+        a, b = np.ascontiguousarray(logged[name]), np.ascontiguousarray(again[name])
+        unequal = np.nonzero(a.view(f"u{a.itemsize}") != b.view(f"u{b.itemsize}"))[0]
+        if len(unequal) and (first is None or unequal[0] < first[0]):
+            first = (int(unequal[0]), name)
+    if first is None:
+        return None
+    row, name = first
+    ours, theirs = logged[name][row : row + 1], again[name][row : row + 1]
+    ulp = abs(int(bits(ours, _KINDS[name])[0]) - int(bits(theirs, _KINDS[name])[0]))
+    return Difference(int(logged["k"][row]), name, float(ours[0]), float(theirs[0]), ulp)

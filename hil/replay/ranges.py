@@ -1,0 +1,36 @@
+"""Numbers of a log that kernels index by, loop to or divide by: none out of its range reaches a kernel."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+
+from hil.control.fac import MAX_GAP
+from hil.control.law import FAC, N_MAX
+from hil.control.references import TABLE, TABLE_MAX
+from hil.log.named import Record
+from hil.signals import DriveState
+
+COUNTERS: Final = 256
+"""Commands that the supervisor remembers: the range of a counter on the wire."""
+RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
+    "safety": {"counter_modulus": (1, COUNTERS)},
+    "law": {"kind": (0, FAC), "max_gap": (1, MAX_GAP), "N": (0, N_MAX - 1)},
+    "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
+    "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},
+    "law_state": {
+        "head": (0, N_MAX - 1),
+        "gap": (0, MAX_GAP),
+        "started": (0, 1),
+        "filled": (0, N_MAX),
+    },
+}
+
+
+def check_ranges(kind: str, record: Record) -> None:
+    """Refuse a record whose numbers would lead a kernel out of its arrays. Raises ValueError."""
+    for name, (low, high) in RANGES[kind].items():
+        value: Any = record[name]
+        if np.any(value < low) or np.any(value > high):
+            raise ValueError(f"{kind}.{name} is {value[0]}, not within {low} to {high}")
