@@ -76,16 +76,19 @@ def logged_machine(log: Log) -> Logged:
     except _UNUSABLE as error:
         raise HilError(f"{log.path}: has no usable parameters in it ({error})") from error
     machine = Machine(safety, new_safety_state(), law, new_law_state(), reference)
-    notes += [f"the log lacks {name}, taken as {_neutral(name):g}" for name in sorted(lacking)]
+    notes += _filled_in(lacking)
     if design is not None:
         notes += _otherwise(log, design, machine, lacking)
     return Logged(machine, tuple(notes))
 
 
-def _neutral(name: str) -> float:
-    """The neutral value of ``record.parameter``."""
-    kind, _, parameter = name.partition(".")
-    return _PARAMETERS[kind][1][parameter]
+def _filled_in(lacking: set[str]) -> list[str]:
+    """What the log lacks, by the value that was taken for it."""
+    by_value: dict[float, list[str]] = {}
+    for name in sorted(lacking):
+        kind, _, parameter = name.partition(".")
+        by_value.setdefault(_PARAMETERS[kind][1][parameter], []).append(name)
+    return [f"the log lacks {', '.join(names)}, taken as {value:g}" for value, names in by_value.items()]
 
 
 def _record(kind: str, given: Any, lacking: set[str]) -> Record:

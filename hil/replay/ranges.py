@@ -7,7 +7,8 @@ from typing import Any, Final
 import numpy as np
 
 from hil.control.fac import MAX_GAP
-from hil.control.law import FAC, N_MAX
+from hil.control.law import N_MAX, PI
+from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.log.named import Record
 from hil.signals import DriveState
@@ -16,7 +17,7 @@ COUNTERS: Final = 256
 """Commands that the supervisor remembers: the range of a counter on the wire."""
 RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
     "safety": {"counter_modulus": (1, COUNTERS)},
-    "law": {"kind": (0, FAC), "max_gap": (1, MAX_GAP), "N": (0, N_MAX - 1)},
+    "law": {"kind": (0, PI), "max_gap": (1, MAX_GAP), "N": (0, N_MAX - 1), "form": (0, FILTER)},
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},
     "law_state": {
@@ -34,3 +35,5 @@ def check_ranges(kind: str, record: Record) -> None:
         value: Any = record[name]
         if np.any(value < low) or np.any(value > high):
             raise ValueError(f"{kind}.{name} is {value[0]}, not within {low} to {high}")
+    if kind == "law" and np.any((record["form"] == FIR) & (record["N"] > FIR_MAX)):
+        raise ValueError(f"law.N is {record['N'][0]}, where weights have room for {FIR_MAX}")
