@@ -52,7 +52,10 @@ def wire_of_log(log: Log) -> WireFacts:
             raise ValueError(f"counter_modulus is {modulus!r:.20}, not within 1 to {COUNTERS}")
         if len(x_lsb) != 3 or not all(math.isfinite(value) and value > 0 for value in (*steps, *x_lsb)):
             raise ValueError("a resolution is no positive number")
-        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2])
+        load_top = float(wire.get("T_L_top", math.inf))
+        if not load_top >= 0:
+            raise ValueError(f"T_L_top is {load_top}")
+        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2], load_top)
     except _UNUSABLE as error:
         raise HilError(f"{log.path}: has no usable wire facts in it ({error})") from error
 
