@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from drivers.codec import Message
-from drivers.mapping import DriveMap
+from drivers.mapping import MEASURED, DriveMap
 from drivers.payload import NO_PAYLOAD, Payload
 from drivers.signal import Signal
 
@@ -33,6 +33,10 @@ class Bound:
         """Number of values of this message's counter, by bits and range; 256 when it has none."""
         return self.message.signals[self.counter].raw_count if self.counter else MOST_COUNTS
 
+    def has(self, parts: Collection[str]) -> bool:
+        """True when it carries one of these parts."""
+        return any(part in parts for part, _ in self.parts)
+
     def encode(self, values: Mapping[str, float]) -> bytes:
         """A frame of a command: ``values`` by signal over the payload. Raises EncodeError."""
         return self.message.encode(values, self.payload.data)
@@ -58,6 +62,16 @@ class Binding:
                 if name == part:
                     return bound.message.signals[signal]
         return None
+
+    @property
+    def slow(self) -> tuple[Bound, ...]:
+        """Messages to read besides those that measure, in the order of their bits.
+
+        What only tells the truth of an emulator is none of them.
+        """
+        return tuple(
+            b for b in self.incoming if not b.has(MEASURED) and {p for p, _ in b.parts} != {"load_true"}
+        )
 
     @property
     def u_step(self) -> float:

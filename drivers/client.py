@@ -67,6 +67,7 @@ DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
 _GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _DOWN = range(9)
+_MISSING_AT: Final = (STATE.names or ()).index("missing_at")
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
 _SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
@@ -190,6 +191,7 @@ class DriveClient:
         messages, signals, needed = incoming_tables(self.binding, tick.dtype)
         self._cells[_NEEDED] = needed
         self._cells[_ECHO_AT] = -1 if self.binding.map.echo else tick.dtype.fields["echo"][1]
+        self._cells[_MISSING_AT] = _offset(tick, "missing") if "missing" in tick.dtype.fields else 0
         args = (self._buffer, messages, signals, self._last, self._state, self._words, raw, self._log)
         self._take: Callable[[int, bool, int], int] = partial(entry(take, *args, 0, False, 0), *args)
         self._translate = translator(self.binding.map.states, lambda: int(self._cells[_CONTROLWORD]))

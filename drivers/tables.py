@@ -28,7 +28,7 @@ class Tables:
         self._messages: list[tuple[Any, ...]] = []
         self._signals: list[tuple[Any, ...]] = []
 
-    def add(self, bound: Bound, rows: list[Row], bit: int = 0, seen: int = 0) -> None:
+    def add(self, bound: Bound, rows: list[Row], bit: int = 0, seen: int = 0, slow: int = 0) -> None:
         """Add a message with its signals; one behind several values of a multiplexer once for each."""
         message, first = bound.message, len(self._signals)
         if bound.counter:
@@ -48,12 +48,12 @@ class Tables:
         for wanted in bound.wanted or (0,):
             self._messages.append(
                 (message.send_id, message.length, message.profile, ids, modulus, first, count, bit, seen,
-                 message.fd, first + count if bound.selector else NO_SELECTOR, wanted, under)
+                 message.fd, first + count if bound.selector else NO_SELECTOR, wanted, under, slow)
             )  # fmt: skip
 
     def watch(self, message: Message) -> None:
         """Add a message that is known by its identifier alone."""
-        self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False, NO_SELECTOR, 0, 0))
+        self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False, NO_SELECTOR, 0, 0, 0))
 
     def records(self) -> tuple[Records, Records]:
         """(messages, signals) as the kernels take them."""
@@ -75,7 +75,9 @@ def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records,
             for part, name in bound.parts
         ]
         seen = STATUS if not bit and "v_dc" in parts else 0
-        tables.add(bound, rows, bit, seen | (STATE_RAW if "state" in parts and binding.map.states else 0))
+        seen |= STATE_RAW if "state" in parts and binding.map.states else 0
+        slow = 1 << binding.slow.index(bound) if bound in binding.slow else 0
+        tables.add(bound, rows, bit, seen, slow)
     watched = [bound.message for bound in binding.outgoing] + [binding.sync, binding.emergency]
     for message in watched:
         if message is not None:

@@ -58,25 +58,26 @@ MESSAGE: Final = np.dtype(
     [
         ("id", "i8"), ("length", "i8"), ("profile", "i8"), ("ids", "u1", (16,)), ("modulus", "i8"),
         ("first", "i8"), ("count", "i8"), ("bit", "i8"), ("seen", "i8"), ("fd", "?"),
-        ("selector", "i8"), ("wanted", "i8"), ("under", "u1", (64,)),
+        ("selector", "i8"), ("wanted", "i8"), ("under", "u1", (64,)), ("slow", "i8"),
     ],
     align=True,
 )  # fmt: skip
 """``modulus`` 0: no counter, else the first signal is one. ``bit``: one for each measurement in it, 0 for
 slow values; ``seen``: what a good frame is flagged with besides. ``selector``: the signal that must have the
 value ``wanted``, or NO_SELECTOR; rows of one identifier follow one another. ``under``: what never changes
-of a command."""
+of a command. ``slow``: its bit in the tick's ``missing``."""
 STATE: Final = np.dtype(
     [
         ("got", "i8"), ("needed", "i8"), ("echo_at", "i8"), ("logged", "i8"),
         ("last_sent", "i8"), ("controlword", "i8"), ("syncs", "i8"), ("pending", "i8"), ("down", "i8"),
-        ("odd_id", "i8"), ("odd_length", "i8"),
+        ("odd_id", "i8"), ("odd_length", "i8"), ("missing_at", "i8"),
     ]
 )  # fmt: skip
 """``last_sent``, ``controlword``: of the last command; ``syncs``: SYNC's counter. ``pending``: flags for the
 next tick; ``down``: the bus was down, nothing more is sent; the client sets both and looks at them.
 ``echo_at``: offset of the tick's echo for a drive that has none, -1 for one that has. ``odd_id``,
-``odd_length``: of the newest frame whose length is not its message's."""
+``odd_length``: of the newest frame whose length is not its message's. ``missing_at``: offset of the tick's
+``missing``, 0 for a record without."""
 FRAME: Final = np.dtype(
     [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
 )
@@ -301,6 +302,9 @@ def take(
     first = m["first"] + (1 if m["modulus"] > 0 else 0)
     for place in range(first, m["first"] + m["count"]):
         put(tick, signals[place], phys_of(raw, m["length"], signals[place], words))
+    if m["slow"] != 0 and s["missing_at"] > 0:
+        at = s["missing_at"]
+        tick[at : at + 4].view(np.uint32)[0] &= np.uint32(0xFFFFFFFF - m["slow"])
     if m["bit"] == 0:
         return (flags & ~FRESH) | m["seen"]
     return complete(s, m, tick, flags) | m["seen"]

@@ -17,9 +17,12 @@ from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.load import coupler_torque_max
 from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-12, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+"""Ranges of physical quantities: no product or square of a few of them overflows or vanishes."""
+Since = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+"""Times [s] whose nanoseconds are whole numbers with room to spare."""
 Record = npt.NDArray[np.void]
 
 
@@ -59,14 +62,14 @@ class Sensors(Table):
 class Firmware(Table):
     """Protection of the drive itself."""
 
-    watchdog_ms: NonNegative = 20.0
+    watchdog_ms: Annotated[float, Field(ge=0, le=3.6e6, allow_inf_nan=False)] = 20.0
     i_trip_a: Positive = 30.0
     w_trip_rad_s: Positive = 300.0
     temperature_trip_c: Positive = 140.0
     ambient_c: Finite = 25.0
     thermal_resistance_k_w: Positive = 0.5
     thermal_time_s: Positive = 600.0
-    status_every: Annotated[int, Field(ge=1)] = 10
+    status_every: Annotated[int, Field(ge=1, le=10**6)] = 10
 
 
 class ConstantLoad(Table):
@@ -81,8 +84,8 @@ class StepLoad(Table):
 
     kind: Literal["step"]
     torque_n_m: Finite
-    at_s: NonNegative
-    until_s: Positive | None = None
+    at_s: Since
+    until_s: Since | None = None
 
     @model_validator(mode="after")
     def _in_order(self) -> StepLoad:
@@ -145,7 +148,7 @@ class PlantConfig(Table):
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     protocol: Literal["house", "inverter"] = "house"
     pacing: Literal["sync", "cyclic"] = "sync"
-    substep_us: Annotated[int, Field(ge=1)] = 500
+    substep_us: Annotated[int, Field(ge=1, le=100_000)] = 500
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
     truth: bool = True
     motor: Annotated[PlantMotor, BeforeValidator(included)]

@@ -11,9 +11,13 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(ge=1e-12, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+"""Ranges of physical quantities: no product or square of a few of them overflows or vanishes."""
+Since = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+Span = Annotated[float, Field(ge=1e-9, le=1e7, allow_inf_nan=False)]
+"""Times [s] whose nanoseconds are whole numbers with room to spare."""
 
 
 class FaultTable(BaseModel):
@@ -21,8 +25,8 @@ class FaultTable(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    at_s: NonNegative
-    for_s: Positive | None = None
+    at_s: Since
+    for_s: Span | None = None
 
     def active(self, t_ns: int) -> bool:
         """True while the fault is there; both ends are exact nanoseconds."""
@@ -48,7 +52,7 @@ class Delay(FrameFault):
     """The frame comes later."""
 
     kind: Literal["delay"]
-    delay_ms: Positive
+    delay_ms: Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
 
 
 class Duplicate(FrameFault):
@@ -143,7 +147,7 @@ class BrownOut(FaultTable):
     """The drive's supply fails: silent, gates off; when it comes back the firmware boots anew."""
 
     kind: Literal["brown-out"]
-    for_s: Positive
+    for_s: Span
 
 
 LinkFault = Drop | Delay | Duplicate | Reorder | Corrupt | FrozenCounter | BusOff

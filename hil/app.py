@@ -30,7 +30,7 @@ from drivers.watch import CommandWatch
 from hil import fused, realtime
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
-from hil.design import Machine, WireFacts, build
+from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Rights, Words, guardian
 from hil.log.origin import origin, package_version
@@ -135,7 +135,25 @@ def wire_facts(binding: Binding) -> WireFacts:
         x_lsb=(measured[0].step, measured[1].step, measured[2].step),
         u_top=binding.u_top,
         T_L_top=load.top if load else math.inf,
+        slow=slow_messages(binding),
+        measured=tuple(part for bound in binding.incoming if bound.has(MEASURED) for part, _ in bound.parts),
     )
+
+
+def slow_messages(binding: Binding) -> tuple[SlowMessage, ...]:
+    """What the drive sends besides its measurements; with SYNC the cycle counts in SYNCs.
+
+    The pages of a multiplexer take turns, so that each comes once in as many cycles as there are.
+    """
+    sync = binding.sync.cycle_ms if binding.sync else 0
+    out = []
+    for bound in binding.slow:
+        cycle, parts = bound.message.cycle_ms, tuple(part for part, _ in bound.parts)
+        pages = sum(other.message.name == bound.message.name for other in binding.incoming)
+        cycle *= max(pages, len(bound.wanted), 1)
+        syncs = cycle / sync if sync else 0.0
+        out.append(SlowMessage(bound.message.name, parts, cycle * 1e-3, syncs))
+    return tuple(out)
 
 
 def load_setup(path: Path, overrides: Overrides) -> Setup:
@@ -270,6 +288,8 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
                     "x_lsb": setup.wire.x_lsb,
                     "u_top": setup.wire.u_top,
                     **({"T_L_top": setup.wire.T_L_top} if math.isfinite(setup.wire.T_L_top) else {}),
+                    "slow": [asdict(message) for message in setup.wire.slow],
+                    "measured": setup.wire.measured,
                 }
             ),
             **origin(),

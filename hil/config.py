@@ -38,9 +38,17 @@ MAX_CONFIG_BYTES = 1 << 20
 # tomllib keeps every prefix of a dotted key: one of 100,000 parts would take 40 GB
 _DEEP_KEY = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){16}""")
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+LEAST, MOST = 1e-12, 1e9
+Positive = Annotated[float, Field(ge=LEAST, le=MOST, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-MOST, le=MOST, allow_inf_nan=False)]
+"""Ranges of physical quantities: no product or square of a few of them overflows or vanishes."""
+Seconds = Annotated[float, Field(ge=1e-6, le=1e7, allow_inf_nan=False)]
+"""Times whose nanoseconds and ticks are whole numbers with room to spare; 1e7 s are four months."""
+Since = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
+Speed = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+MOST_GUARDIAN_MS = 10_000
+"""A guardian that waits longer is none."""
 
 
 class Table(BaseModel):
@@ -105,8 +113,8 @@ class LoopTable(Table):
     rate_hz: Annotated[int, Field(ge=10, le=20_000)] = 1000
     pacing: Literal["sync", "feedback", "timer"] = "sync"
     clock: Literal["realtime", "lockstep"] = "realtime"
-    duration_s: Positive | None = None
-    feedback_timeout_us: Annotated[int, Field(ge=10)] | None = None
+    duration_s: Seconds | None = None
+    feedback_timeout_us: Annotated[int, Field(ge=10, le=100_000)] | None = None
     max_gap_ticks: Annotated[int, Field(ge=1, le=64)] = 20
     shadow: bool = False
 
@@ -116,6 +124,16 @@ class LoopTable(Table):
         if 1_000_000_000 % value:
             raise ValueError(f"{value} Hz has no whole number of nanoseconds; take one that divides 1e9")
         return value
+
+    @model_validator(mode="after")
+    def _shorter_than_the_gap(self) -> LoopTable:
+        given, most = self.feedback_timeout_us, self.max_gap_ticks * self.period_ns // 1000
+        if given is not None and given > most:
+            raise ValueError(
+                f"feedback_timeout_us = {given} is longer than max_gap_ticks periods, {most} us: one tick "
+                "without feedback would end the run; take less, 0.6 of the period is the default"
+            )
+        return self
 
     @property
     def period_ns(self) -> int:
@@ -132,7 +150,7 @@ class RealtimeTable(Table):
     """What is asked of the operating system; what it does not grant is said, not assumed."""
 
     fifo_priority: Annotated[int, Field(ge=0, le=98)] = 50
-    cpu: Annotated[int, Field(ge=0)] | None = None
+    cpu: Annotated[int, Field(ge=0, le=4095)] | None = None
     lock_memory: bool = True
 
 
@@ -140,7 +158,7 @@ class GuardianTable(Table):
     """The process that stops the drive when the loop falls silent for longer than any tolerated skip."""
 
     enabled: bool = True
-    timeout_ms: Positive | None = None
+    timeout_ms: Annotated[float, Field(ge=1, le=MOST_GUARDIAN_MS, allow_inf_nan=False)] | None = None
 
     def timeout_ns(self, loop: LoopTable) -> int:
         """Default: five periods more than the gap at which the supervisor stops, at least 10 ms."""
@@ -166,7 +184,7 @@ class DriveTable(Table):
     node_id: Annotated[int, Field(ge=0, le=255)] = 1
     node_rule: str = ""
     """Where the node's number goes in identifiers, as "id << 5"; empty: CANopen's."""
-    heartbeat_timeout_s: Positive = 3.0
+    heartbeat_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] = 3.0
     signals: dict[str, Any] | None = None
     """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""
 
@@ -175,7 +193,9 @@ def _annotation(key: Key) -> tuple[Any, Any]:
     """Type and default of a member's key, as pydantic takes them."""
     if key.type == "flag":
         return bool, key.default
-    bounds: Any = Field(gt=key.above, ge=key.least, le=key.most, allow_inf_nan=False)
+    most = MOST if key.most is None else key.most
+    least = LEAST if key.least is None and key.above == 0.0 else key.least
+    bounds: Any = Field(gt=key.above, ge=least, le=most, allow_inf_nan=False)
     kind: Any = Annotated[float, bounds]
     if key.type == "numbers":
         kind = Annotated[list[kind], Field(min_length=1, max_length=key.count)]
@@ -244,19 +264,19 @@ class LimitsTable(Table):
     T_L_max_n_m: NonNegative = 0.0
     v_dc_min_v: NonNegative = 0.0
     v_dc_max_v: Positive = 1e4
-    temperature_max_c: Finite = 120.0
+    temperature_max_c: Annotated[float, Field(ge=-273.15, le=1e4, allow_inf_nan=False)] = 120.0
     i_continuous_a: Positive | None = None
     i2t_max_a2s: Positive | None = None
-    power_window_s: Positive = 1.0
+    power_window_s: Annotated[float, Field(ge=1e-3, le=1e5, allow_inf_nan=False)] = 1.0
     energy_max_j: Positive | None = None
     applied_deviation_max_v: Positive | None = None
     following_error_rad_s: Positive | None = None
-    following_error_s: Positive = 0.1
+    following_error_s: Annotated[float, Field(ge=1e-6, le=3600, allow_inf_nan=False)] = 0.1
     i_d_max_a: Positive | None = None
     open_phase_min_a: Positive | None = None
     trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
-    guard_trip_ticks: Annotated[int, Field(ge=1)] = 200
-    soft_start_s: NonNegative = 0.0
+    guard_trip_ticks: Annotated[int, Field(ge=1, le=10**9)] = 200
+    soft_start_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 0.0
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitsTable:
@@ -275,15 +295,17 @@ class FeedbackTable(Table):
     error_budget: Annotated[int, Field(ge=1, le=10_000)] = 8
     frozen_ticks: Annotated[int, Field(ge=1, le=10_000)] = 5
     repeat_ticks: Annotated[int, Field(ge=2, le=10_000)] | None = None
-    enable_timeout_s: Positive = 2.0
+    enable_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] = 2.0
+    status_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] | None = None
+    """Age that a slow message of the drive may reach; by default from its cycle time in the DBC."""
 
 
 class StepReference(Table):
     """w* jumps from 0 to ``w_rad_s`` at ``at_s``."""
 
     kind: Literal["step"]
-    w_rad_s: Finite
-    at_s: NonNegative = 0.0
+    w_rad_s: Speed
+    at_s: Since = 0.0
     i_q_a: Finite = 0.0
 
 
@@ -291,10 +313,10 @@ class RampReference(Table):
     """w* ramps to ``w_rad_s`` with ``rate_rad_s2``, and back to 0 from ``down_at_s`` on."""
 
     kind: Literal["ramp"]
-    w_rad_s: Finite
+    w_rad_s: Speed
     rate_rad_s2: Positive
-    at_s: NonNegative = 0.0
-    down_at_s: Positive | None = None
+    at_s: Since = 0.0
+    down_at_s: Since | None = None
     i_q_a: Finite = 0.0
 
 
@@ -302,11 +324,11 @@ class SCurveReference(Table):
     """Jerk-limited ramp to ``w_rad_s``, and back to 0 from ``down_at_s`` on."""
 
     kind: Literal["s-curve"]
-    w_rad_s: Finite
+    w_rad_s: Speed
     rate_rad_s2: Positive
     jerk_rad_s3: Positive
-    at_s: NonNegative = 0.0
-    down_at_s: Positive | None = None
+    at_s: Since = 0.0
+    down_at_s: Since | None = None
     i_q_a: Finite = 0.0
 
 
@@ -314,8 +336,8 @@ class SineReference(Table):
     """w* = offset + amplitude sin(2 pi f t)."""
 
     kind: Literal["sine"]
-    offset_rad_s: Finite = 0.0
-    amplitude_rad_s: Finite
+    offset_rad_s: Speed = 0.0
+    amplitude_rad_s: Speed
     frequency_hz: Positive
     i_q_a: Finite = 0.0
 
@@ -324,8 +346,8 @@ class TableReference(Table):
     """Piecewise linear through (t, w) points."""
 
     kind: Literal["table"]
-    t_s: Annotated[list[Finite], Field(min_length=2, max_length=256)]
-    w_rad_s: Annotated[list[Finite], Field(min_length=2, max_length=256)]
+    t_s: Annotated[list[Since], Field(min_length=2, max_length=256)]
+    w_rad_s: Annotated[list[Speed], Field(min_length=2, max_length=256)]
     i_q_a: Finite = 0.0
 
     @model_validator(mode="after")
@@ -349,8 +371,8 @@ class LogTable(Table):
     folder: str = "../logs"
     name: str | None = None
     frames: bool = True
-    split_s: Annotated[float, Field(ge=1)] | None = None
-    split_mb: Annotated[float, Field(ge=1)] | None = None
+    split_s: Annotated[float, Field(ge=1, le=1e7, allow_inf_nan=False)] | None = None
+    split_mb: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)] | None = None
 
 
 class CriteriaTable(Table):
@@ -365,10 +387,10 @@ class CriteriaTable(Table):
     estimate_error_max_n_m: NonNegative | None = None
     ripple_max_rad_s: NonNegative | None = None
     iae_max_rad: NonNegative | None = None
-    skipped_max: Annotated[int, Field(ge=0)] | None = None
-    dropped_max: Annotated[int, Field(ge=0)] | None = None
-    lost_feedback_max: Annotated[int, Field(ge=0)] | None = None
-    crc_errors_max: Annotated[int, Field(ge=0)] | None = None
+    skipped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    dropped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    lost_feedback_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    crc_errors_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
     lateness_p999_max_us: NonNegative | None = None
     lateness_max_us: NonNegative | None = None
     bus_load_max_percent: NonNegative | None = None
@@ -457,8 +479,17 @@ def _describe(problem: Any, model: type[BaseModel]) -> str:
         return f"{path}: missing; add it"
     text = problem["msg"].removeprefix("Value error, ")
     text = text[:1].lower() + text[1:]
-    given = problem.get("input")
-    return f"{path}: {text}" + (f", not {given!r}" if isinstance(given, (int, float, str)) else "")
+    return f"{path}: {text}{_given(problem.get('input'))}"
+
+
+def _given(value: Any) -> str:
+    """What stood there, when it is no table; a number of hundreds of digits in short."""
+    if not isinstance(value, (int, float, str)):
+        return ""
+    text = (
+        repr(value) if not isinstance(value, int) or value.bit_length() < 256 else "a number beyond any range"
+    )
+    return f", not {text if len(text) <= 80 else text[:77] + '...'}"
 
 
 def _written(loc: tuple[Any, ...]) -> list[str]:

@@ -16,13 +16,15 @@ from hil.config import LimitsTable, MotorTable, ReferenceTable, RunConfig
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
-from hil.guard import SAFETY_PARAMS
+from hil.guard import MEASURED, MOST_MESSAGES, SAFETY_PARAMS
 from hil.kernel import PLACED, new_safety_state, prepare, step, whole, whole_at
 from hil.log.named import to_named
 from hil.signals import TickArray, new_ticks
 
 CYCLIC_ECHO_LAG = 3
 """Commands by which the echo of a drive that sends by its own clock may be behind."""
+NO_CYCLE_S = 1.0
+"""Age that a slow message may reach when neither DBC nor configuration say how often it comes [s]."""
 NEVER = SHADOW_WAITS = 2**62
 """Ticks for which a shadow run waits until somebody else enables the drive: for ever."""
 
@@ -30,8 +32,29 @@ Record = npt.NDArray[np.void]
 
 
 @dataclass(frozen=True, slots=True)
+class SlowMessage:
+    """A message that the drive sends besides its measurements: its parts, and its cycle, 0 where not known.
+
+    ``cycle_s`` is in seconds, or for a drive that is paced by SYNC ``cycle_syncs`` in SYNCs.
+    """
+
+    name: str
+    parts: tuple[str, ...]
+    cycle_s: float = 0.0
+    cycle_syncs: float = 0.0
+
+    def cycle_ticks(self, rate_hz: float) -> float:
+        """Its cycle in periods of the loop."""
+        return self.cycle_syncs or self.cycle_s * rate_hz
+
+
+@dataclass(frozen=True, slots=True)
 class WireFacts:
-    """What the kernel must know of the wire: command resolution [V, N m], counter, measurement LSBs."""
+    """What the kernel must know of the wire: command resolution [V, N m], counter, measurement LSBs.
+
+    ``slow``: the slow messages in the order of their bits in ``missing``; ``measured``: parts that come with
+    each measurement. Both are empty in logs that lack them.
+    """
 
     u_lsb: float
     T_L_lsb: float
@@ -39,6 +62,8 @@ class WireFacts:
     x_lsb: tuple[float, float, float]
     u_top: float
     T_L_top: float = math.inf
+    slow: tuple[SlowMessage, ...] = ()
+    measured: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +182,35 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     }
     for name, value in (values | _optional(limits)).items():
         p[name] = value
+    _slow_messages(p, config, wire)
     if config.loop.shadow:  # command and reference are somebody else's, not ours
         for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):
             p[name] = math.inf
     return p
+
+
+def age_limit(config: RunConfig, message: SlowMessage) -> int:
+    """Age that a slow message may reach [periods]: as configured, else five cycles and what is ridden out.
+
+    Without a cycle time in the DBC it is NO_CYCLE_S.
+    """
+    rate, given = config.loop.rate_hz, config.feedback.status_timeout_s
+    if given is not None:
+        return max(1, round(given * rate))
+    cycle = message.cycle_ticks(rate)
+    if cycle <= 0.0:
+        return round(NO_CYCLE_S * rate)
+    return math.ceil(5.0 * cycle) + config.feedback.hold_ticks + config.loop.max_gap_ticks
+
+
+def _slow_messages(p: Record, config: RunConfig, wire: WireFacts) -> None:
+    """Ages, and which message carries what may be NaN; logs without these facts keep their old rules."""
+    p["rules"], p["messages"] = 1, min(len(wire.slow), MOST_MESSAGES)
+    for index, message in enumerate(wire.slow[:MOST_MESSAGES]):
+        p["age_max"][0, index] = age_limit(config, message)
+    for row, part in enumerate(("v_dc", "temperature_motor", "temperature_inverter")):
+        bits = [1 << index for index, message in enumerate(wire.slow) if part in message.parts]
+        p["carried_by"][0, row] = MEASURED if part in wire.measured else sum(bits)
 
 
 def frozen_voltage(config: RunConfig, wire: WireFacts) -> float:

@@ -41,7 +41,7 @@ from hil.kernel import whole_at
 from hil.log.push import push
 from hil.log.recorder import Recorder
 from hil.loop import BEGUN, DECIDED, MAX_NS, NOT_BEGUN, RECORDED, SENT, Plan, Whole, none_compiled
-from hil.signals import TICK
+from hil.signals import ALL_MISSING, TICK
 from hil.trouble import TROUBLE
 
 PHASES: Final = (
@@ -153,7 +153,7 @@ def since(deadline_ns: int, times: Any) -> Any:
 def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_failed: bool) -> None:
     """The fields of a tick that is neither late nor the first after others that were skipped."""
     t["k"], t["t_ns"], t["lateness_ns"] = k, deadline_ns, woken_ns - deadline_ns
-    t["gap"], t["skipped"], t["rx_flags"] = 1, 0, 0
+    t["gap"], t["skipped"], t["rx_flags"], t["missing"] = 1, 0, 0, ALL_MISSING
     t["request"], t["log_failed"] = asked, log_failed
 
 

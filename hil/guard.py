@@ -52,12 +52,26 @@ SAFETY_PARAMS: Final = np.dtype(
         ("u_lsb", "f8"),
         ("T_L_lsb", "f8"),
         ("J", "f8"),
+        ("rules", "i8"),
+        ("messages", "i8"),
+        ("age_max", "i8", 8),
+        ("carried_by", "i8", 3),
     ],
     align=True,
 )
-"""Limits, times in ticks, and the resolution of the command on the wire. Units as in the config."""
+"""Limits, times in ticks, and the resolution of the command on the wire. Units as in the config.
 
-SAFETY_NEUTRAL: Final[dict[str, float]] = {}
+``rules``: 1 for those of this version, 0 for those of a log that lacks the field. ``messages``: slow messages
+of the drive's map, whose age may be ``age_max`` periods; ``carried_by``: what v_dc, motor and inverter
+temperature come with, as bits of ``came``, 0 for what the drive does not send.
+"""
+MEASURED: Final = 1 << 16
+"""Bit of ``came`` for the messages that measure."""
+MOST_MESSAGES: Final = 8
+MOST_PERIODS: Final = 1024
+"""Periods since the last measurement that are still counted; no run in operation waits so long."""
+
+SAFETY_NEUTRAL: Final[dict[str, float]] = {"rules": 0, "messages": 0, "age_max": 0, "carried_by": 0}
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -97,10 +111,21 @@ SAFETY_STATE: Final = np.dtype(
         ("ua_q", "f8"),
         ("ua_d", "f8"),
         ("ua_T", "f8"),
+        ("elapsed", "i8"),
+        ("gap", "i8"),
+        ("armed_gaps", "i8"),
+        ("came", "i8"),
+        ("age", "i8", 8),
+        ("stale_at", "i8"),
     ],
     align=True,
 )
-"""State of supervisor and guard: CiA 402 state, latched reason, counters, window sums, sent commands."""
+"""State of supervisor and guard: CiA 402 state, latched reason, counters, window sums, sent commands.
+
+``elapsed``: periods since the last measurement that was judged; ``gap``: of this tick; ``came``: slow
+messages that have come once, and MEASURED; ``age``: of each [periods]; ``stale_at``: ``stale`` when the stop
+began.
+"""
 
 OVER_SPEED: Final = 0
 OVER_CURRENT: Final = 1
@@ -111,10 +136,26 @@ FOLLOWING: Final = 5
 
 
 @jit
+def elapse(p: Any, s: Any, t: Any) -> None:
+    """Count the periods up to this tick, whether they had a measurement or not. Version 0 counts none."""
+    if p["rules"] > 0:
+        s["elapsed"] = min(s["elapsed"] + t["gap"], MOST_PERIODS)
+        s["gap"] = min(int(t["gap"]), MOST_PERIODS)
+
+
+@jit
+def grown(count: int, exceeded: bool, periods: int) -> int:
+    """Periods for which ``exceeded`` has held: its first sight counts 1, the next the time since the last."""
+    if not exceeded:
+        return 0
+    return count + max(1, periods) if count > 0 else 1
+
+
+@jit
 def persists(s: Any, index: int, exceeded: bool, ticks: int) -> bool:
-    """True once ``exceeded`` has held for ``ticks`` consecutive ticks; the count is ``s['over'][index]``."""
+    """True once ``exceeded`` has held for ``ticks`` periods; the count is ``s['over'][index]``."""
     over = s["over"]
-    over[index] = over[index] + 1 if exceeded else 0
+    over[index] = grown(over[index], exceeded, s["elapsed"])
     return bool(over[index] >= ticks)
 
 
@@ -124,11 +165,14 @@ def windows_trip(p: Any, s: Any, t: Any) -> int:
 
     i2t:    s += (i^2 - i_continuous^2) T_s, not below 0
     energy: e += 1.5 (u_q i_q + u_d i_d) T_s - e T_s / window
+
+    for every period since the last measurement: what was not measured counts as what is.
     """
     i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
-    s["i2t"] = max(0.0, s["i2t"] + (i_squared - p["i_continuous"] * p["i_continuous"]) * p["T_s"])
     power = 1.5 * (s["ua_q"] * t["i_q"] + s["ua_d"] * t["i_d"])
-    s["energy"] = s["energy"] + power * p["T_s"] - s["energy"] * p["T_s"] / p["power_window"]
+    for _ in range(max(1, s["elapsed"])):
+        s["i2t"] = max(0.0, s["i2t"] + (i_squared - p["i_continuous"] * p["i_continuous"]) * p["T_s"])
+        s["energy"] = s["energy"] + power * p["T_s"] - s["energy"] * p["T_s"] / p["power_window"]
     if s["i2t"] > p["i2t_max"]:
         return Reason.I2T.value
     if abs(s["energy"]) > p["energy_max"]:
@@ -138,11 +182,12 @@ def windows_trip(p: Any, s: Any, t: Any) -> int:
 
 @jit
 def is_frozen(p: Any, s: Any, t: Any) -> bool:
-    """True once speed and currents have stood still for ``frozen_ticks`` although the voltage moved.
+    """True once speed and currents have stood still for ``frozen_ticks`` periods although the voltage moved.
 
     The voltage must have moved by ``frozen_du`` since they began to stand still: so much moves the current
     by many steps of the wire within a tick. A drive that limits the voltage is left out. Where the sensors
-    are known to be noisy, ``repeat_ticks`` equal readings of a turning motor tell it at constant voltage too.
+    are known to be noisy, ``repeat_ticks`` periods of equal readings of a turning motor tell it at constant
+    voltage too.
     """
     seen = s["seen"]
     same = t["w"] == seen[0] and t["i_q"] == seen[1] and t["i_d"] == seen[2]
@@ -152,22 +197,56 @@ def is_frozen(p: Any, s: Any, t: Any) -> bool:
         return False
     dq, dd = s["ua_q"] - s["seen_q"], s["ua_d"] - s["seen_d"]
     moved = dq * dq + dd * dd > p["frozen_du"] * p["frozen_du"]
-    s["frozen"] = s["frozen"] + 1 if moved else 0
-    s["repeats"] = s["repeats"] + 1 if t["w"] != 0.0 else 0
+    s["frozen"] = grown(s["frozen"], moved, s["elapsed"])
+    s["repeats"] = grown(s["repeats"], t["w"] != 0.0, s["elapsed"])
     return bool(s["frozen"] >= p["frozen_ticks"] or s["repeats"] >= p["repeat_ticks"])
+
+
+@jit
+def sent(p: Any, s: Any, part: int) -> bool:
+    """True once the message that carries v_dc (0), motor (1) or inverter temperature (2) has come."""
+    bit = p["carried_by"][part]
+    return bool(bit != 0 and s["came"] & bit == bit)
+
+
+@jit
+def all_numbers(p: Any, s: Any, t: Any) -> bool:
+    """False when any measured signal is NaN or infinite. What the drive does not send is absent, no fault."""
+    if not (math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])):
+        return False
+    if sent(p, s, 0) and not math.isfinite(t["v_dc"]):
+        return False
+    if sent(p, s, 1) and not math.isfinite(t["temperature_motor"]):
+        return False
+    if sent(p, s, 2) and not math.isfinite(t["temperature_inverter"]):
+        return False
+    if p["rules"] == 0 or not p["shadow"]:
+        return True
+    return bool(math.isfinite(t["u_q_seen"]) and math.isfinite(t["u_d_seen"]))
+
+
+@jit
+def hottest(p: Any, t: Any) -> float:
+    """The higher of the temperatures that there are, NaN for none: one that is absent hides no other."""
+    motor, inverter = t["temperature_motor"], t["temperature_inverter"]
+    if p["rules"] > 0 and math.isnan(motor):
+        return float(inverter)
+    if p["rules"] > 0 and math.isnan(inverter):
+        return float(motor)
+    return float(max(motor, inverter))
 
 
 @jit
 def judge_measurement(p: Any, s: Any, t: Any) -> int:
     """Return the Reason to stop that a fresh measurement gives, 0 for none.
 
-    NaN and infinity stop at once; speed, current, temperature and DC link after ``trip_ticks``.
+    NaN and infinity stop at once; speed, current, temperature and DC link after ``trip_ticks`` periods.
     """
-    if not (math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])):
+    if not all_numbers(p, s, t):
         return Reason.NOT_A_NUMBER.value
     ticks = p["trip_ticks"]
     i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
-    temperature = max(t["temperature_motor"], t["temperature_inverter"])
+    temperature = hottest(p, t)
     speed = persists(s, OVER_SPEED, abs(t["w"]) > p["w_max"], ticks)
     current = persists(s, OVER_CURRENT, i_squared > p["i_trip"] * p["i_trip"], ticks)
     hot = persists(s, OVER_TEMPERATURE, temperature > p["temperature_max"], ticks)
@@ -289,10 +368,10 @@ def write_command(s: Any, t: Any, u_q: float, u_d: float, T_L: float, flags: int
 
 @jit
 def persistent_excess(p: Any, s: Any, flags: int) -> int:
-    """Return GUARD_PERSISTENT once the guard has had to change the command for guard_trip_ticks in a row.
+    """Return GUARD_PERSISTENT once the guard has had to change the command for guard_trip_ticks periods.
 
     The soft start is a planned limit and does not count.
     """
     changed = flags & ~(GuardFlag.SOFT_START.value | GuardFlag.DENORMAL.value)
-    s["clamped"] = s["clamped"] + 1 if changed else 0
+    s["clamped"] = grown(s["clamped"], changed != 0, s["gap"])
     return Reason.GUARD_PERSISTENT.value if s["clamped"] >= p["guard_trip_ticks"] else Reason.NONE.value

@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.jit import array_at, jit
-from hil.control.law import FAC, LAW_PARAMS, LAW_STATE, apply, command, observe, reset
+from hil.control.law import FAC, LAW_PARAMS, LAW_STATE, apply, ask, is_saturated, observe, reset, to_circle
 from hil.control.references import REFERENCE, reference_at
 from hil.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
-from hil.signals import Controlword, DriveState, Reason, RxFlag
+from hil.signals import Controlword, DriveState, GuardFlag, Reason, RxFlag
 from hil.supervisor import begin_stop, supervise
 
 Record = npt.NDArray[np.void]
@@ -67,18 +67,38 @@ def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 
 
 @jit
-def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
-    """Ask the law for the next command; without fresh feedback hold the last one."""
+def note_asked(ls: Any, t: Any) -> None:
+    """Write what the law asks for to the tick."""
+    t["T_L_law"], t["u_q_law"], t["u_d_law"] = ls["u"][0], ls["u"][1], ls["u"][2]
+    t["i_q_ref"] = ls["i_q_ref"]
+
+
+@jit
+def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> Any:
+    """Ask the law for the next command; without fresh feedback hold the last one.
+
+    Returns (u_q, u_d, T_L) in the voltage circle, NaN where the law asks for what is no number, and the flag
+    of a law that is at a limit. Version 0 of the rules records what is asked for after the circle, without
+    the flag.
+    """
     if t["state"] != DriveState.OPERATION_ENABLED:
         t["u_q_law"], t["u_d_law"], t["T_L_law"], t["i_q_ref"] = 0.0, 0.0, 0.0, 0.0
-        return
+        return 0.0, 0.0, 0.0, 0
     if not (t["rx_flags"] & RxFlag.FRESH and ls["started"]):
         t["u_q_law"], t["u_d_law"], t["T_L_law"] = s["u_q"], s["u_d"], s["T_L"]
         t["i_q_ref"] = ls["i_q_ref"]
-        return
-    command(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], voltage_limit(p, s))
-    t["T_L_law"], t["u_q_law"], t["u_d_law"] = ls["u"][0], ls["u"][1], ls["u"][2]
-    t["i_q_ref"] = ls["i_q_ref"]
+        return s["u_q"], s["u_d"], s["T_L"], 0
+    limit = voltage_limit(p, s)
+    ask(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], limit)
+    note_asked(ls, t)
+    number = math.isfinite(ls["u"][1]) and math.isfinite(ls["u"][2])
+    saturated = is_saturated(lp, ls, limit)
+    to_circle(ls, limit)
+    if p["rules"] == 0:
+        note_asked(ls, t)
+        return ls["u"][1], ls["u"][2], ls["u"][0], 0
+    u_q = ls["u"][1] if number else math.nan
+    return u_q, ls["u"][2], ls["u"][0], GuardFlag.SATURATED.value if saturated else 0
 
 
 @jit
@@ -109,8 +129,9 @@ def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
     if t["state"] == DriveState.OPERATION_ENABLED and before != DriveState.OPERATION_ENABLED:
         reset(law)
         observe(q, law, t["w"], t["i_q"], t["i_d"], True, t["gap"])
-    control(p, s, q, law, t)
-    reason = guard_command(p, s, t, t["u_q_law"], t["u_d_law"], t["T_L_law"])
+    u_q, u_d, T_L, saturated = control(p, s, q, law, t)
+    reason = guard_command(p, s, t, u_q, u_d, T_L)
+    t["guard_flags"] |= saturated
     if reason != Reason.NONE:
         begin_stop(s, reason)
         t["state"], t["reason"] = s["state"], s["reason"]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from hil.ports import Clock, Drive, Recorder
-from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, cell
+from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell
 from hil.trouble import TROUBLE, Trouble
 
 Pacing = Literal["sync", "feedback", "timer"]
@@ -109,8 +109,8 @@ class Cells:
     """The fields of the tick that the loop itself writes and reads."""
 
     __slots__ = (
-        "computed_ns", "gap", "k", "lateness_ns", "log_failed", "reason", "received_ns", "recorded_ns",
-        "request", "rx_flags", "send", "sent_ns", "skipped", "state", "t_ns",
+        "computed_ns", "gap", "k", "lateness_ns", "log_failed", "missing", "reason", "received_ns",
+        "recorded_ns", "request", "rx_flags", "send", "sent_ns", "skipped", "state", "t_ns",
     )  # fmt: skip
 
     def __init__(self, ticks: TickArray) -> None:
@@ -213,7 +213,7 @@ class Loop:
         """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on."""
         now, t = self._clock.now_ns, self._cells
         self._stamp(k, deadline_ns, gap, now_ns)
-        t.rx_flags[0] = 0
+        t.rx_flags[0], t.missing[0] = 0, ALL_MISSING
         if self._sends_sync:
             self._exchange(tick, deadline_ns)
         elif self._plan.pacing == "timer":

@@ -75,6 +75,10 @@ class RxFlag(IntEnum):
     GUARDIAN_LOST = 1 << 12
 
 
+ALL_MISSING: Final = 2**32 - 1
+"""``missing`` at the beginning of a tick: each mapped message that comes takes its bit out."""
+
+
 class Reason(IntEnum):
     """Why the supervisor left normal operation, or the guard changed a command. 0 is no reason."""
 
@@ -108,10 +112,11 @@ class Reason(IntEnum):
     FROZEN_FEEDBACK = 27
     FOLLOWING_ERROR = 28
     CURRENT_UNCONTROLLED = 29
+    STALE_STATUS = 30
 
 
 class GuardFlag(IntEnum):
-    """Bits of what the guard changed in this tick's command."""
+    """Bits of what the guard changed in this tick's command. SATURATED: the law was at a limit of its own."""
 
     NOT_A_NUMBER = 1 << 0
     VOLTAGE = 1 << 1
@@ -121,6 +126,7 @@ class GuardFlag(IntEnum):
     SOFT_START = 1 << 5
     DENORMAL = 1 << 6
     APPLIED_DEVIATES = 1 << 7
+    SATURATED = 1 << 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +193,15 @@ FIELDS: Final[tuple[Field, ...]] = (
         "input",
         "shadow run: d voltage of the other controller, applied from now on",
     ),
+    Field(
+        36,
+        "missing",
+        "u4",
+        "",
+        "input",
+        "bit i: the i-th slow message of the drive's map has not come since the previous tick",
+        absent=0,
+    ),
     Field(48, "state", "u4", "", "output", "DriveState of the supervisor"),
     Field(49, "reason", "u4", "", "output", "Reason that latched, 0 while none"),
     Field(50, "guard_flags", "u4", "", "output", "GuardFlag bits"),
@@ -207,8 +222,12 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(58, "d_hat_q", "f8", "A/s", "output", "estimated disturbance of the q current channel"),
     Field(59, "d_hat_d", "f8", "A/s", "output", "estimated disturbance of the d current channel"),
     Field(60, "i_q_ref", "f8", "A", "output", "q current asked by the speed law, after its limit"),
-    Field(61, "u_q_law", "f8", "V", "output", "q voltage asked by the control law"),
-    Field(62, "u_d_law", "f8", "V", "output", "d voltage asked by the control law"),
+    Field(
+        61, "u_q_law", "f8", "V", "output", "q voltage asked by the control law, before the voltage circle"
+    ),
+    Field(
+        62, "u_d_law", "f8", "V", "output", "d voltage asked by the control law, before the voltage circle"
+    ),
     Field(63, "T_L_law", "f8", "N m", "output", "load torque asked by the control law (fac), else 0"),
     Field(64, "u_q", "f8", "V", "output", "q voltage sent: guarded and rounded to the wire"),
     Field(65, "u_d", "f8", "V", "output", "d voltage sent"),

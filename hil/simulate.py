@@ -29,7 +29,7 @@ from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
 from hil.log.split import SplitFile, open_run
 from hil.loop import transition_event
-from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
+from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.snapshot import StateFollower
 
 Record = npt.NDArray[np.void]
@@ -43,13 +43,14 @@ def receive(pp: Any, ps: Any, out: Any, t: Any) -> None:
     on_sync(pp[0], ps[0], o)
     t["w"], t["i_q"], t["i_d"] = o["w"], o["i_q"], o["i_d"]
     t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
-    t["rx_flags"] = RxFlag.FRESH.value
+    t["rx_flags"], t["missing"] = RxFlag.FRESH.value, ALL_MISSING
     t["T_L_true"] = o["T_L_true"]
     if o["emcy_due"]:
         t["rx_flags"] |= RxFlag.EMERGENCY.value
         t["drive_error"] = o["error"]
     if o["status_due"]:
         t["rx_flags"] |= RxFlag.STATUS.value
+        t["missing"] = ALL_MISSING - 1  # STATUS is the only slow message, if there is one
         t["v_dc"], t["drive_error"] = o["v_dc"], o["error"]
         t["temperature_motor"], t["temperature_inverter"] = o["temperature_motor"], o["temperature_inverter"]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from hil.control.jit import jit
-from hil.guard import FOLLOWING, judge_measurement, persists
+from hil.guard import FOLLOWING, MEASURED, elapse, grown, judge_measurement, persists
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
 
 STOP_TICKS = 20
@@ -20,6 +20,35 @@ STOP_TICKS = 20
 def leaky(level: int, error: bool) -> int:
     """Error level: +4 for an error, -1 for a good tick, not below 0."""
     return level + 4 if error else max(0, level - 1)
+
+
+@jit
+def note_ages(p: Any, s: Any, t: Any) -> None:
+    """Count the age of each slow message [periods], and note which have come once."""
+    for index in range(p["messages"]):
+        if int(t["missing"]) & (1 << index):
+            s["age"][index] += t["gap"]
+        else:
+            s["age"][index] = 0
+            s["came"] |= 1 << index
+    if p["rules"] > 0 and t["rx_flags"] & RxFlag.FRESH:
+        s["came"] |= MEASURED
+
+
+@jit
+def all_came(p: Any, s: Any) -> bool:
+    """True once each slow message has come: before that nobody knows DC link and temperatures."""
+    every = (1 << int(p["messages"])) - 1
+    return bool(s["came"] & every == every)
+
+
+@jit
+def judge_ages(p: Any, s: Any) -> int:
+    """Return the Reason once a slow message has not come for longer than its limit."""
+    for index in range(p["messages"]):
+        if s["age"][index] > p["age_max"][index]:
+            return Reason.STALE_STATUS.value
+    return Reason.NONE.value
 
 
 @jit
@@ -76,7 +105,7 @@ def judge_timing(p: Any, s: Any, t: Any) -> int:
 
 @jit
 def judge_echo(p: Any, s: Any, t: Any) -> int:
-    """Count fresh ticks in a row whose echo is not the last command's; return the Reason past the hold time.
+    """Count periods for which the echo is not the last command's; return the Reason past the hold time.
 
     Either the drive does not get the commands, or what comes is the answer to an older SYNC: both make
     feedback that is good frame by frame worthless. An echo that stands still does not count as right when
@@ -86,7 +115,7 @@ def judge_echo(p: Any, s: Any, t: Any) -> int:
         return Reason.NONE.value
     lag = (int(s["counter"]) - int(t["echo"])) % int(p["counter_modulus"])
     right = lag <= p["echo_lag"] and t["echo"] != s["echo"]
-    s["lagging"] = 0 if right else s["lagging"] + 1
+    s["lagging"] = grown(s["lagging"], not right, s["elapsed"])
     s["echo"] = t["echo"]
     return Reason.COMMAND_LOST.value if s["lagging"] > p["hold_ticks"] else Reason.NONE.value
 
@@ -97,7 +126,7 @@ def judge_following(p: Any, s: Any, t: Any) -> int:
 
     i_d is held at zero. With a phase open the current stays on one stator axis, so that tan theta = i_d/i_q
     while the rotor turns by theta: |i_d| > |i_q|/3 in 80 % of the ticks, at any load whose current the
-    sensors can tell. So ticks count up and down.
+    sensors can tell. So periods count up and down; one measurement alone never fills the count.
     """
     if not t["rx_flags"] & RxFlag.FRESH:
         return Reason.NONE.value
@@ -105,7 +134,8 @@ def judge_following(p: Any, s: Any, t: Any) -> int:
     lost = persists(s, FOLLOWING, off, p["w_error_ticks"])
     i_d = abs(t["i_d"])
     far = i_d > p["i_d_max"] or (i_d > p["open_phase_min"] and 3.0 * i_d > abs(t["i_q"]))
-    s["uncontrolled"] = s["uncontrolled"] + 1 if far else max(0, s["uncontrolled"] - 1)
+    periods = min(max(1, s["elapsed"]), max(1, p["w_error_ticks"] // 2))
+    s["uncontrolled"] = s["uncontrolled"] + periods if far else max(0, s["uncontrolled"] - periods)
     if s["uncontrolled"] >= p["w_error_ticks"]:
         return Reason.CURRENT_UNCONTROLLED.value
     return Reason.FOLLOWING_ERROR.value if lost else Reason.NONE.value
@@ -120,6 +150,7 @@ def first(a: int, b: int) -> int:
 @jit
 def judge(p: Any, s: Any, t: Any) -> int:
     """Return the most telling Reason to stop now, 0 for none. All judges run, so that all counts advance."""
+    elapse(p, s, t)
     bus = judge_bus(p, s, t)
     timing = judge_timing(p, s, t)
     measured = Reason.NONE.value
@@ -130,7 +161,10 @@ def judge(p: Any, s: Any, t: Any) -> int:
         reason = first(reason, judge_drive(s, t))
         reason = first(reason, judge_echo(p, s, t))
         reason = first(reason, judge_following(p, s, t))
+    if t["rx_flags"] & RxFlag.FRESH:
+        s["elapsed"] = 0
     reason = first(reason, timing)
+    reason = first(reason, judge_ages(p, s))
     reason = first(reason, Reason.LOG_FAILED.value if t["log_failed"] else 0)
     return first(reason, judge_request(t))
 
@@ -161,6 +195,7 @@ def begin_stop(s: Any, reason: int) -> None:
     """Latch the reason and enter the stop that belongs to it."""
     s["reason"] = reason
     s["stop_ticks"] = 0
+    s["stale_at"] = s["stale"]
     fault = is_fault(reason)
     s["state"] = DriveState.FAULT_REACTION_ACTIVE.value if fault else DriveState.QUICK_STOP_ACTIVE.value
 
@@ -170,11 +205,15 @@ def handshake(p: Any, s: Any, t: Any) -> int:
     """Follow the drive through its enable handshake; return the controlword for its state.
 
     A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words. Without
-    fresh feedback the last word stands: another would undo the step that the drive may just have made.
+    fresh feedback the last word stands: another would undo the step that the drive may just have made. It is
+    switched on, but not enabled before each slow message has come.
     """
     if not t["rx_flags"] & RxFlag.FRESH and s["armed_ticks"] > 1:
         return int(s["word"])
     if t["rx_flags"] & RxFlag.FRESH:
+        on = t["drive_state"] == DriveState.OPERATION_ENABLED or t["drive_state"] == DriveState.SWITCHED_ON
+        if on and not all_came(p, s):
+            return Controlword.SWITCH_ON.value
         if t["drive_state"] == DriveState.OPERATION_ENABLED:
             s["state"] = DriveState.OPERATION_ENABLED.value
             s["run_ticks"] = 0
@@ -194,6 +233,8 @@ def handshake(p: Any, s: Any, t: Any) -> int:
 def arming(p: Any, s: Any, t: Any) -> int:
     """One tick of READY_TO_SWITCH_ON or SWITCHED_ON: handshake, or the Reason to give up."""
     s["armed_ticks"] += 1
+    if p["rules"] > 0:
+        s["armed_gaps"] += max(0, int(t["gap"]) - 1)
     reason = judge_arming(p, s, t)
     if reason != 0:
         begin_stop(s, reason)
@@ -204,13 +245,20 @@ def arming(p: Any, s: Any, t: Any) -> int:
 
 @jit
 def judge_arming(p: Any, s: Any, t: Any) -> int:
-    """While the drive is being enabled, missing feedback is covered by the enable timeout."""
+    """While the drive is being enabled, missing feedback is covered by the enable timeout.
+
+    A shadow run waits for its drive, and so for the drive's slow messages.
+    """
+    elapse(p, s, t)
     reason = judge_bus(p, s, t)
     if t["rx_flags"] & RxFlag.FRESH:
         reason = first(reason, judge_measurement(p, s, t))
+        s["elapsed"] = 0
+        if not p["shadow"]:
+            reason = first(reason, judge_ages(p, s))
     reason = first(reason, Reason.LOG_FAILED.value if t["log_failed"] else 0)
     reason = first(reason, judge_request(t))
-    timed_out = s["armed_ticks"] > p["enable_ticks"]
+    timed_out = s["armed_ticks"] + s["armed_gaps"] > p["enable_ticks"]
     return first(reason, Reason.ENABLE_TIMEOUT.value if timed_out else 0)
 
 
@@ -254,6 +302,7 @@ def supervise(p: Any, s: Any, t: Any) -> None:
     state = s["state"]
     controlword = Controlword.DISABLE_VOLTAGE.value
     send = 1
+    note_ages(p, s, t)
     if state == DriveState.SWITCH_ON_DISABLED and s["reason"] == 0 and t["request"] == Request.ARM:
         s["state"] = DriveState.READY_TO_SWITCH_ON.value
         controlword = arming(p, s, t)

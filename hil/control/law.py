@@ -471,6 +471,7 @@ def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
     to_circle(s, u_limit)
     total[1] += p["T_s"] * k_i[1] * (i_q_ref - x[1] + (u[1] - u_q) / k_p[1])
     total[2] += p["T_s"] * k_i[2] * (-x[2] + (u[2] - u_d) / k_p[2])
+    u[1], u[2] = u_q, u_d
 
 
 @jit
@@ -487,6 +488,13 @@ def command(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit
 
     w_ref, dw_ref are those of this tick; u_limit [V] is the radius of the voltage circle.
     """
+    ask(p, s, w_ref, dw_ref, i_q_ref, u_limit)
+    to_circle(s, u_limit)
+
+
+@jit
+def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: float) -> None:
+    """:func:`command` before the voltage circle: s['u'] is what the law asks for."""
     look_ahead(p, s)
     if p["kind"] == FAC:
         fac_law(p, s, w_ref, dw_ref, i_q_ref)
@@ -495,4 +503,12 @@ def command(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit
     else:
         s["i_q_ref"] = speed_law(p, s, w_ref, dw_ref)
         current_law(p, s)
-    to_circle(s, u_limit)
+
+
+@jit
+def is_saturated(p: Any, s: Any, u_limit: float) -> bool:
+    """True when what :func:`ask` asked for is on or past a limit: the circle, i_max, T_L_max."""
+    u_q, u_d = s["u"][1], s["u"][2]
+    if u_q * u_q + u_d * u_d >= u_limit * u_limit or abs(s["i_q_ref"]) >= p["i_max"]:
+        return True
+    return bool(p["kind"] == FAC and abs(s["u"][0]) >= p["T_L_max"])

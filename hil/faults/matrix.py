@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hil.config import NonNegative, Positive, Table, load_toml, read_toml
+from hil.config import Finite, Positive, Table, load_toml, read_toml
 from hil.errors import ConfigError
 from hil.signals import Reason
 
@@ -24,7 +24,7 @@ class Stall(Table):
     """The controller is stopped (SIGSTOP) and goes on after ``for_ms``."""
 
     kind: Literal["stall"]
-    at_s: NonNegative
+    at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
     for_ms: Annotated[int, Field(ge=1, le=5000)]
 
 
@@ -32,29 +32,29 @@ class WriterKilled(Table):
     """The log's writer process is killed (SIGKILL)."""
 
     kind: Literal["writer-killed"]
-    at_s: NonNegative
+    at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 
 
 class DiskFull(Table):
     """The log can't grow any more: the writer's file size limit is set to what it has."""
 
     kind: Literal["disk-full"]
-    at_s: NonNegative
+    at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 
 
 class ClockStep(Table):
     """The wall clock that the controller's process reads jumps by ``step_s``."""
 
     kind: Literal["clock-step"]
-    at_s: NonNegative
-    step_s: float
+    at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    step_s: Finite
 
 
 class InterfaceDown(Table):
     """The interface goes down (in a network namespace of the row's own), for good or for ``for_ms``."""
 
     kind: Literal["interface-down"]
-    at_s: NonNegative
+    at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
     for_ms: Annotated[int, Field(ge=1, le=5000)] | None = None
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from hil.config import RunConfig, validate
 from hil.control.law import LAW_NEUTRAL, LAW_PARAMS, new_law_state
 from hil.control.references import REFERENCE, REFERENCE_NEUTRAL
-from hil.design import Machine, WireFacts, build
+from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errors import HilError
 from hil.guard import SAFETY_NEUTRAL, SAFETY_PARAMS
 from hil.kernel import new_safety_state
@@ -55,9 +55,19 @@ def wire_of_log(log: Log) -> WireFacts:
         load_top = float(wire.get("T_L_top", math.inf))
         if not load_top >= 0:
             raise ValueError(f"T_L_top is {load_top}")
-        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2], load_top)
+        slow = tuple(_slow(one) for one in wire.get("slow", ()))
+        measured = tuple(str(part) for part in wire.get("measured", ()))
+        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2], load_top, slow, measured)
     except _UNUSABLE as error:
         raise HilError(f"{log.path}: has no usable wire facts in it ({error})") from error
+
+
+def _slow(given: Any) -> SlowMessage:
+    """A slow message as a log names it. Raises ValueError, TypeError or KeyError."""
+    cycles = float(given["cycle_s"]), float(given["cycle_syncs"])
+    if not all(0.0 <= cycle <= 1e6 for cycle in cycles):
+        raise ValueError(f"a cycle of {given['name']!r:.40} is out of range")
+    return SlowMessage(str(given["name"]), tuple(str(part) for part in given["parts"]), *cycles)
 
 
 def machine_of(log: Log) -> Machine:

@@ -10,13 +10,14 @@ from hil.control.fac import MAX_GAP
 from hil.control.law import N_MAX, PI
 from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
+from hil.guard import MOST_MESSAGES
 from hil.log.named import Record
 from hil.signals import DriveState
 
 COUNTERS: Final = 256
 """Commands that the supervisor remembers: the range of a counter on the wire."""
 RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
-    "safety": {"counter_modulus": (1, COUNTERS)},
+    "safety": {"counter_modulus": (1, COUNTERS), "messages": (0, MOST_MESSAGES)},
     "law": {"kind": (0, PI), "max_gap": (1, MAX_GAP), "N": (0, N_MAX - 1), "form": (0, FILTER)},
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},

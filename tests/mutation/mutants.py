@@ -30,7 +30,13 @@ import pytest
 
 from tests.mutation.operators import ROOT, Mutant, mutants
 
-SAFETY = ("test_guard.py", "test_guard_limits.py", "test_supervisor_rules.py", "test_supervisor.py")
+SAFETY = (
+    "test_guard.py",
+    "test_guard_limits.py",
+    "test_supervisor_rules.py",
+    "test_supervisor.py",
+    "test_guard_time.py",
+)
 JUDGES = {
     "hil/guard.py": SAFETY,
     "hil/supervisor.py": SAFETY,

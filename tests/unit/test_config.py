@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pydantic import BaseModel
 
-from hil.config import MAX_CONFIG_BYTES, RunConfig, load_toml
+from firmware_model.config import PlantConfig
+from hil.config import MAX_CONFIG_BYTES, RunConfig, _models_in, _tags, load_toml
 from hil.errors import ConfigError
+from tests.conftest import ROOT
 
 
 def problems(path: Path, *overrides: str) -> str:
@@ -92,3 +97,61 @@ def test_tables_must_increase(configs: Path, tmp_path: Path) -> None:
         text[:start] + '[reference]\nkind="table"\nt_s=[0.0,0.0]\nw_rad_s=[0.0,1.0]\n' + text[end:]
     )
     assert "t_s must increase" in problems(path)
+
+
+def numbers(model: type[BaseModel], given: dict[str, Any], path: str = "") -> Iterator[str]:
+    """Every number of a configuration's tables as ``table.key``; of tables of several kinds the given one."""
+    for name, field in model.model_fields.items():
+        if isinstance(given.get(name), list):
+            continue
+        inner = [m for m in _models_in(field.annotation) if "kind" not in m.model_fields]
+        inner += [m for m in _models_in(field.annotation) if (given.get(name) or {}).get("kind") in _tags(m)]
+        for one in inner[:1]:
+            yield from numbers(one, given.get(name) or {}, f"{path}{name}.")
+        if not inner and any(kind in repr(field.annotation) for kind in ("int", "float")):
+            yield path + name
+
+
+def config_numbers() -> list[str]:
+    given = RunConfig.model_validate(
+        load_toml(ROOT / "configs/demo.toml", RunConfig).model_dump()
+    ).model_dump()
+    return [
+        name for name in numbers(RunConfig, given) if name not in ("drive.signals", "observer.speed.kind")
+    ]
+
+
+@pytest.mark.parametrize("text", ["1e23", "1e300", "1" + 400 * "0", "-1e23", "-1e300", "nan", "inf"])
+def test_no_number_is_beyond_every_range(configs: Path, text: str) -> None:
+    keys = config_numbers()
+    assert len(keys) > 60 and {"limits.w_max_rad_s", "guardian.timeout_ms", "reference.w_rad_s"} <= set(keys)
+    for key in keys:
+        found = problems(configs / "demo.toml", f"{key}={text}")
+        assert key.rpartition(".")[2] in found and len(found) < 600, key
+
+
+@pytest.mark.parametrize("text", ["1e23", "1e300", "1" + 400 * "0", "-1e23", "nan", "inf"])
+def test_no_number_of_a_plant_is_beyond_every_range(configs: Path, text: str) -> None:
+    given = load_toml(configs / "plants/demo.toml", PlantConfig).model_dump()
+    keys = list(numbers(PlantConfig, given))
+    assert len(keys) > 20
+    loads = ["[{kind='constant', torque_n_m=%s}]", "[{kind='step', torque_n_m=1.0, at_s=%s}]"]
+    faults = ["[{kind='load', at_s=%s, torque_n_m=1.0}]", "[{kind='delay', at_s=0.5, delay_ms=%s}]"]
+    settings = [f"{key}={text}" for key in keys] + [f"load={one % text}" for one in loads]
+    for setting in [*settings, *(f"fault={one % text}" for one in faults)]:
+        with pytest.raises(ConfigError):
+            load_toml(configs / "plants/demo.toml", PlantConfig, [setting])
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("loop.feedback_timeout_us=100001", "less than or equal to 100000"),
+        ("loop.feedback_timeout_us=20001", "longer than max_gap_ticks periods"),
+        ("guardian.timeout_ms=10001", "less than or equal to 10000"),
+        ("guardian.timeout_ms=1e300", "less than or equal to 10000"),
+        ("motor.J_kg_m2=5e-324", "greater than or equal to"),
+    ],
+)
+def test_ranges_of_times(configs: Path, override: str, said: str) -> None:
+    assert said in problems(configs / "demo.toml", override)

@@ -258,7 +258,8 @@ def test_parameters_in_the_log_stand_against_another_design() -> None:
     config = json.loads(log.attachments["config.json"])
     config["limits"]["w_max_rad_s"] += 1.0
     verdict = replay_log(changed_log(log, "config.json", json.dumps(config)))
-    assert verdict.verdict == "same" and "would design w_max otherwise" in verdict.notes[-1]
+    assert verdict.verdict == "same"
+    assert any("would design w_max otherwise" in note for note in verdict.notes)
     config["limits"]["not there any more"] = 1.0
     verdict = replay_log(changed_log(log, "config.json", json.dumps(config)))
     assert verdict.verdict == "same" and "does not take the config" in verdict.notes[0]
