@@ -467,6 +467,14 @@ class DriveClient:
             frame.encode(self._now())
         self._transmit(frame)
 
+    def _note_length(self, frame: Frame) -> None:
+        """Remember a frame that has another length than its message, as the kernel does."""
+        whole = frame.can_id | frame.flags
+        if any(
+            b.message.send_id == whole and b.message.length != len(frame.data) for b in self.binding.incoming
+        ):
+            self._state["odd_id"], self._state["odd_length"] = whole, len(frame.data)
+
     def odd_length(self) -> str:
         """Which message came with another length than the DBC gives it, in words; empty when none did."""
         odd_id, length = (int(self._state[name][0]) for name in ("odd_id", "odd_length"))
@@ -489,6 +497,7 @@ class DriveClient:
         while (left := end - time.monotonic_ns()) > 0:
             frame = self._link.receive(left)
             if frame is not None and frame.can_id | frame.flags in self._alive:
+                self._note_length(frame)
                 return True
         return False
 

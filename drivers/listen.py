@@ -28,6 +28,7 @@ class Heard:
     first_ns: int = 0
     last_ns: int = 0
     values: dict[str, float] = field(default_factory=dict)
+    data: bytes = b""
 
     @property
     def rate_hz(self) -> float:
@@ -94,6 +95,7 @@ def _count(heard: Heard, message: Message, counter: str, data: bytes, now_ns: in
     if len(data) != message.length or not message.valid(data):
         heard.invalid += 1
         return
+    heard.data = data
     before = heard.values.get(counter)
     heard.values = {**heard.values, **message.decode(data)}
     if before is not None:

@@ -75,6 +75,8 @@ def _states(drive: DriveMap) -> Iterator[str]:
             yield f'states: {raw} = "{name}"; known are {", ".join(STATES)}'
     if states and "operation enabled" not in states.values():
         yield 'states: no value is "operation enabled"; the drive could never be seen running'
+    if states and not set(states.values()) - {"operation enabled", "fault", "fault reaction active"}:
+        yield "states: no value shows the drive switched off; nobody could see it stop"
 
 
 def plain_states(drive: DriveMap, state: Signal | None) -> DriveMap:
@@ -148,4 +150,4 @@ def _unsendable(bound: Bound) -> Iterator[str]:
         words: tuple[float, ...] = CONTROLWORDS if part == "controlword" else (0.0, 1.0)
         for value in words if not SENT[part].units else (0.0,):
             if problem := misfit(bound.message.signals[name], value):
-                yield f"{bound.message.name}.{name}: {value:g} can't be sent: {problem}"
+                yield f"{bound.message.name}.{name}: {problem}"

@@ -17,6 +17,7 @@ from drivers.signal import FLOAT_TOPS, Signal
 
 EXACT = 1e-6
 """Of a step: by how much a value may be off what the bits show."""
+MOST = 10**308
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +90,7 @@ class Layout:
         """Bits of a constant; a value that they do not show is a mistake."""
         signal = self._message.signals[name]
         if problem := misfit(signal, value):
-            self.mistakes.append(f"{self._where(name)}: {value:g} can't be sent: {problem}")
+            self.mistakes.append(f"{self._where(name)}: {problem}")
             return 0
         return signal.to_bits(value)
 
@@ -159,9 +160,11 @@ def _fits(signal: Signal, raw: float) -> bool:
 
 def misfit(signal: Signal, value: float) -> str:
     """Why a signal can't carry a value, to a millionth of its step; empty when it can."""
+    if abs(value) > MOST:
+        return "more than 1e308 can't be sent"
     try:
         bits = signal.to_bits(value)
     except EncodeError as error:
-        return str(error)
+        return f"{value:g} can't be sent: {error}"
     exact = signal.is_float or abs(signal.to_phys(bits) - value) <= signal.step * EXACT
-    return "" if exact else f"{value:g} is between two steps"
+    return "" if exact else f"{value:g} can't be sent: it is between two steps"

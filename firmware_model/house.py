@@ -60,6 +60,13 @@ class HouseFrames:
         self.ignored: Counter[str] = Counter()
 
     @property
+    def spoken(self) -> dict[int, int]:
+        """Length of each message that it sends or takes, by identifier."""
+        load = [self.load_command] if self.load_command else []
+        messages = [self.command, *load, *(message for message, _ in self.answers)]
+        return {message.send_id: message.length for message in messages}
+
+    @property
     def wire(self) -> Wire:
         """Resolution and range of the measured signals."""
         signals = self.answers[-1][0].signals

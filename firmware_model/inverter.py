@@ -48,6 +48,11 @@ class InverterFrames:
         self.ignored: Counter[str] = Counter()
 
     @property
+    def spoken(self) -> dict[int, int]:
+        """Length of each message that it sends or takes, by identifier."""
+        return {STATE_ID: 12, SUPPLY_ID: 8, TRUTH_ID: 8, DEMAND_ID: 12}
+
+    @property
     def wire(self) -> Wire:
         """Resolution and range of the measured signals, in SI units."""
         w, i = RPM_LSB * (math.pi / 30), MILLIAMPERE_LSB * 1e-3

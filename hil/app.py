@@ -166,8 +166,9 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
     shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
-    check_limits(str(path), config.limits, shown)
     wire = wire_facts(binding)
+    carried = {"u_max_v": wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
+    check_limits(str(path), config.limits, shown, carried)
     return Setup(path, config, database, binding, wire, build(config, wire))
 
 
@@ -431,7 +432,7 @@ def _recorded(
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts)
             client.discard()
-            result = _run_armed(setup, loop, plan, recorder, clock, request)
+            result = _run_armed(setup, loop, plan, recorder, clock, request, client.odd_length)
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
         raise
@@ -451,6 +452,8 @@ def _await_drive(setup: Setup, client: DriveClient) -> None:
         raise ArmingError(
             f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, nothing was sent; {hint}"
         )
+    if odd := client.odd_length():
+        raise ArmingError(f"{odd}; correct the DBC, or the drive's mapping; nothing was sent")
 
 
 def plan_of(config: RunConfig) -> Plan:
@@ -468,6 +471,7 @@ def _run_armed(
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
+    odd_length: Callable[[], str],
 ) -> RunResult:
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
@@ -492,6 +496,9 @@ def _run_armed(
         if asked := who_asked(os.getpid()):
             t_ns, k, who = asked
             recorder.event(t_ns, k, "stop-asked", who)
+        if odd := odd_length():
+            recorder.event(clock.now_ns(), outcome.ticks + outcome.skipped, "length", odd)
+            say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
         dropped = recorder.dropped
         ended = failure or Reason(outcome.reason).name.lower()
         result = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}

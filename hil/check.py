@@ -22,6 +22,8 @@ PROTOCOL_VERSION = 1
 MAX_QUEUE = 32
 RATE_TOLERANCE = 0.1
 NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+OPERATIONAL = 5
+HEAT = ("temperature_motor", "temperature_inverter")
 FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
 SILENT = "a drive that only answers SYNC can't show it before arming; nothing to do"
@@ -147,11 +149,13 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
         drive_row(traffic, setup.binding, config.drive.heartbeat_timeout_s),
         *feedback_rows(setup, traffic, silent_ok),
         frames_row(traffic),
+        *length_rows(traffic, setup.binding),
+        *started_rows(setup.binding),
         others_row(traffic, setup.binding),
         state_row(traffic, setup.binding, values),
         *version_rows(setup, traffic, silent_ok),
         motion_row(values, config.limits, silent_ok),
-        *([supply_row(values, config.limits, silent_ok)] if setup.binding.map.v_dc else []),
+        *supply_rows(setup.binding, values, config.limits, silent_ok),
     ]
 
 
@@ -197,6 +201,28 @@ def frames_row(traffic: Traffic) -> Row:
     return row("frames", good, found, "is the DBC the drive's own; wiring, termination, a second drive?")
 
 
+def length_rows(traffic: Traffic, binding: Binding) -> list[Row]:
+    """One row for each mapped message that comes with another length than the DBC says."""
+    remedy = "correct the DBC's length: no frame of this one is taken"
+    lengths = {b.message.name: b.message.length for b in (*binding.incoming, *binding.outgoing)}
+    odd = [(name, traffic.of(name).odd_length, length) for name, length in lengths.items()]
+    return [
+        Row(f"length {name}", "fail", f"{name}: length {came}, DBC {length}", remedy)
+        for name, came, length in odd
+        if came is not None
+    ]
+
+
+def started_rows(binding: Binding) -> list[Row]:
+    """What goes out with each command though the map does not name it."""
+    said = [
+        f"{bound.message.name}.{name} = {value:g} {unit}".rstrip()
+        for bound in binding.outgoing
+        for name, value, unit in bound.payload.started
+    ]
+    return [Row("start values", "pass", f"{', '.join(said)} (GenSigStartValue)")] if said else []
+
+
 def others_row(traffic: Traffic, binding: Binding) -> Row:
     """Does somebody else command the drive."""
     messages = [binding.sync, *(bound.message for bound in binding.outgoing)]
@@ -215,13 +241,26 @@ def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> R
         if state == DriveState.OPERATION_ENABLED:
             return Row("drive state", "warn", found, "somebody has enabled it; disable it before arming")
         return row("drive state", state not in FAULTS and not error, found, remedy)
+    if code := _emergency(traffic, binding):
+        return Row("drive state", "fail", f"error 0x{code:04X} by its emergency message", remedy)
     beat = _nmt_state(traffic, binding)
     if beat is None:
         return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
-    found = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"
+    nmt = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"
     if values.get("error"):
-        return Row("drive state", "fail", f"{found}, error 0x{int(values['error']):04X}", remedy)
-    return row("drive state", beat == 5, found, "set the drive operational (NMT start)", "warn")
+        return Row("drive state", "fail", f"{nmt}, error 0x{int(values['error']):04X}", remedy)
+    if beat != OPERATIONAL:
+        return Row("drive state", "warn", f"its node is {nmt}", "set the drive operational (NMT start)")
+    found = f"unknown before SYNC: its node is {nmt}, and is that with a drive in FAULT, too"
+    return Row(
+        "drive state", "warn", found, "the run sees it in its first ticks and enables no drive in FAULT"
+    )
+
+
+def _emergency(traffic: Traffic, binding: Binding) -> int:
+    """Error code of the newest emergency message (CiA 301: its first two bytes), 0 for none."""
+    heard = traffic.of(binding.emergency.name) if binding.emergency else Heard()
+    return int.from_bytes(heard.data[:2], "little")
 
 
 def _nmt_state(traffic: Traffic, binding: Binding) -> float | None:
@@ -257,15 +296,39 @@ def motion_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -
     return row("speed and current", good, found, "sensor scale or offset, DBC, limits")
 
 
-def supply_row(values: dict[str, float], limits: LimitsTable, silent_ok: bool) -> Row:
-    """Are DC link and temperatures within the limits."""
-    if "v_dc" not in values:
-        return _unseen("supply and heat", silent_ok)
-    v = values["v_dc"]
-    hot = max(values.get("temperature_motor", 0.0), values.get("temperature_inverter", 0.0))
-    found = f"{v:.1f} V of {limits.v_dc_min_v:g} .. {limits.v_dc_max_v:g}, {hot:.0f} degC"
-    good = limits.v_dc_min_v <= v <= limits.v_dc_max_v and hot < limits.temperature_max_c
-    return row("supply and heat", good, found, "switch on the DC link, let it cool, or correct [limits]")
+def supply_rows(
+    binding: Binding, values: dict[str, float], limits: LimitsTable, silent_ok: bool
+) -> list[Row]:
+    """Are DC link and temperatures within the limits; what the drive does not send is nobody's to judge."""
+    mapped = [part for part in ("v_dc", *HEAT) if binding.signal(part)]
+    if not mapped:
+        return []
+    if not any(part in values for part in mapped):
+        return [_unseen("supply and heat", silent_ok)]
+    volts, degrees = values.get("v_dc"), [values[part] for part in HEAT if part in values]
+    hot = max(degrees) if degrees else None
+    low, high = limits.v_dc_min_v, limits.v_dc_max_v
+    found = ", ".join(
+        (
+            f"{volts:.1f} V of {low:g} .. {high:g}" if volts is not None else "no DC-link voltage",
+            f"{hot:.0f} degC" if hot is not None else "no temperature",
+        )
+    )
+    good = (volts is None or low <= volts <= high) and all(t < limits.temperature_max_c for t in degrees)
+    if not good:
+        return [
+            Row("supply and heat", "fail", found, "switch on the DC link, let it cool, or correct [limits]")
+        ]
+    if volts is None or hot is None:
+        return [
+            Row(
+                "supply and heat",
+                "warn",
+                f"{found}: nothing watches it",
+                "map the signal, if the drive has it",
+            )
+        ]
+    return [Row("supply and heat", "pass", found)]
 
 
 def _unseen(what: str, silent_ok: bool) -> Row:

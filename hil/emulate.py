@@ -6,14 +6,16 @@ import signal
 from collections import Counter
 from pathlib import Path
 
+from drivers.binding import bind
 from drivers.bus import Link, open_link
 from drivers.codec import Database
+from drivers.mapping import MEASURED
 from firmware_model.config import PlantConfig, build_params, new_state
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults
 from firmware_model.node import Node, compile_kernels, frames_of, wire_of
 from hil import realtime
-from hil.app import Overrides, bus_settings
+from hil.app import Overrides, bus_settings, drive_map
 from hil.config import RunConfig, load_toml
 from hil.errors import ConfigError
 
@@ -35,7 +37,9 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     lockstep = config.loop.clock == "lockstep"
     acted = Counter[int]()
     faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted) if plant.fault else None
-    modulus = frames_of(database, plant.protocol).counter_modulus
+    frames = frames_of(database, plant.protocol)
+    check_spoken(path, config, frames.spoken)
+    modulus = frames.counter_modulus
     watched = plant.fault or plant.black_box
     node = Node(
         faulty or link,
@@ -54,6 +58,30 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     motor = plant.motor.name or "inline"
     what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {motor}, {config.loop.clock}"
     return node, faulty or link, what
+
+
+def check_spoken(path: Path, config: RunConfig, spoken: dict[int, int]) -> None:
+    """Refuse an emulated drive that does not speak what the run maps. Raises ConfigError.
+
+    ``spoken``: length of each message that it sends or takes, by identifier.
+    """
+    drive = config.drive
+    database = Database(path.parent / drive.dbc, drive.node_id, drive.node_rule)
+    made = bind(drive_map(config, database, str(path)), database, load=config.controller.kind == "fac")
+    needed = [b.message for b in made.incoming if {part for part, _ in b.parts} & set(MEASURED)]
+    strange = [
+        f"{message.name} (0x{message.can_id:X}, {message.length} bytes)"
+        for message in (*needed, *(bound.message for bound in made.outgoing))
+        if spoken.get(message.send_id) != message.length
+    ]
+    if strange:
+        raise ConfigError(
+            str(path),
+            [
+                f"emulator.plant: the emulated drive knows no {', '.join(dict.fromkeys(strange))} as "
+                f"{drive.dbc} has it for node {drive.node_id}; emulate what speaks it, or take another DBC"
+            ],
+        )
 
 
 def warm_up(path: Path, config: RunConfig) -> None:

@@ -31,12 +31,21 @@ NEEDED: Final = (
 """Limits that need one of these signals; only what the configuration itself sets is judged."""
 
 
-def check_limits(where: str, limits: LimitsTable, spans: Spans) -> None:
-    """Raise ConfigError with every limit that no frame of this drive can show to be passed.
+def check_limits(
+    where: str, limits: LimitsTable, spans: Spans, carried: Mapping[str, float] | None = None
+) -> None:
+    """Raise ConfigError with every limit that no frame of this drive can show to be passed, or can carry.
 
-    ``spans``: smallest and largest value of each part that the drive sends.
+    ``spans``: smallest and largest value of each part that the drive sends; ``carried``: largest command of
+    either sign that fits its signal, by the limit's key.
     """
-    if problems := list(_problems(limits, spans)):
+    problems = list(_problems(limits, spans))
+    for key, top in (carried or {}).items():
+        if key in limits.model_fields_set and getattr(limits, key) > top:
+            problems.append(
+                f"limits.{key}: a command carries no more than {top:g}; take less, or correct the DBC"
+            )
+    if problems:
         raise ConfigError(where, problems)
 
 

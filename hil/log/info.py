@@ -123,7 +123,8 @@ def _from_summary(path: Path, stream: IO[bytes]) -> Info:
         raise DamagedError("there is no footer")
     if not 0 < footer.summary_start < at or at - footer.summary_start > MAX_RECORD:
         raise DamagedError("there is no summary")
-    out, topics, counts = Info(path, size), {}, {}
+    out, topics = Info(path, size), {}
+    counts: dict[int, int] | None = None
     for record in _wanted(stream, footer, at):
         if isinstance(record, Channel):
             topics[record.id] = record.topic
@@ -136,6 +137,8 @@ def _from_summary(path: Path, stream: IO[bytes]) -> Info:
             found = _record_at(stream, record.offset, size)
             if isinstance(found, Metadata):
                 out.metadata[found.name] = dict(found.metadata)
+    if counts is None:  # not counted is not 0
+        raise DamagedError("there are no statistics")
     out.counts = {topic: counts.get(number, 0) for number, topic in topics.items()}
     if "run" not in out.metadata:
         raise LogError(f"{path}: is no log of hil (it has no run metadata)")
