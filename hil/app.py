@@ -39,6 +39,7 @@ from hil.log.split import part_path
 from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
 from hil.ports import Drive
 from hil.progress import say, watching
+from hil.reachable import out_of_reach
 from hil.shadow import ShadowDrive
 from hil.shipped import log_base
 from hil.showable import check_limits
@@ -80,6 +81,8 @@ class Setup:
     binding: Binding
     wire: WireFacts
     machine: Machine
+    warnings: tuple[str, ...] = ()
+    """What it asks for and can't get (:mod:`hil.reachable`)."""
 
 
 @dataclass(slots=True)
@@ -169,7 +172,7 @@ def load_setup(path: Path, overrides: Overrides) -> Setup:
     wire = wire_facts(binding)
     carried = {"u_max_v": wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
     check_limits(str(path), config.limits, shown, carried)
-    return Setup(path, config, database, binding, wire, build(config, wire))
+    return Setup(path, config, database, binding, wire, build(config, wire), out_of_reach(config, wire))
 
 
 def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
@@ -342,6 +345,14 @@ def check_arming(setup: Setup, arm: bool) -> None:
     )
 
 
+def check_reachable(setup: Setup) -> None:
+    """Say what can't be had; refuse it on a bus that may be real. Raises ArmingError."""
+    for line in setup.warnings:
+        say(f"warning: {line}")
+    if setup.warnings and not (setup.config.loop.shadow or is_emulated_bus(setup.config)):
+        raise ArmingError(f"{setup.warnings[0]}; nothing was sent")
+
+
 def load_found(setup: Setup) -> tuple[str, bool]:
     """Worst-case bus load of this run in words, with the frames that make it, and whether it is allowed."""
     bus = setup.config.bus
@@ -379,6 +390,7 @@ def compile_kernels(setup: Setup) -> None:
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
     """Arm and run a configuration; returns after a safe stop. Raises HilError before anything is sent."""
     check_arming(setup, arm)
+    check_reachable(setup)
     check_load(setup)
     request = request or StopRequest()
     config = setup.config

@@ -15,7 +15,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
-from hil.preflight import Row, clock_row, disk_row, realtime_rows, row
+from hil.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
 
 PROTOCOL_VERSION = 1
@@ -34,12 +34,21 @@ def check(setup: Setup) -> list[Row]:
     config = setup.config
     return [
         *bus_rows(setup),
+        *reach_rows(setup),
         load_row(setup),
         *heard_rows(setup),
         *realtime_rows(config.realtime),
         clock_row(config.loop.period_ns),
         disk_row(log_path(setup, "check"), needed_bytes(config)),
     ]
+
+
+def reach_rows(setup: Setup) -> list[Row]:
+    """What the configuration asks for and can't get; on a bus that may be real no run starts with it."""
+    if not setup.warnings:
+        return [Row("reference and poles", "pass", "within the limits of speed, voltage and sampling")]
+    verdict: Verdict = "warn" if is_emulated_bus(setup.config) else "fail"
+    return [Row("reference and poles", verdict, *line.rsplit("; ", 1)) for line in setup.warnings]
 
 
 def passed(rows: list[Row]) -> bool:

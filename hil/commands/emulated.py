@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
 
 
 def register(commands: Commands) -> None:
@@ -58,6 +58,8 @@ def cmd_simulate(args: argparse.Namespace) -> int:
     if args.sweep or args.plant_sweep:
         return _sweep(args)
     setup = load_setup(args.config, overrides(args))
+    for line in setup.warnings:
+        say(f"warning: {line}")
     loop = setup.config.loop
     total = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
     with progress("simulate", total) as seen:

@@ -1,0 +1,98 @@
+"""What a configuration asks for and can't get: said before the run, and refused on a bus that may be real.
+
+The speed that a reference reaches and the voltage that it needs there, poles that the sampling can't follow,
+times that are no whole number of periods. The check is of the steady state without load: what fails here
+never works; what passes may still saturate under load, and the record flags that (``GuardFlag.SATURATED``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+from hil.config import ReferenceTable, RunConfig
+from hil.design import WireFacts
+
+
+def out_of_reach(config: RunConfig, wire: WireFacts) -> tuple[str, ...]:
+    """One line for each thing that can't be had: key, what is wrong, what to do."""
+    return (*_speed(config, wire), *_voltage(config), *_poles(config), *_delays(config))
+
+
+def peak(reference: ReferenceTable) -> float:
+    """Largest |w*| [rad/s] of a reference."""
+    if reference.kind == "table":
+        return max(abs(w) for w in reference.w_rad_s)
+    if reference.kind == "sine":
+        return abs(reference.offset_rad_s) + abs(reference.amplitude_rad_s)
+    return abs(reference.w_rad_s)
+
+
+def voltage_at(config: RunConfig, w: float) -> float:
+    """|u| [V] that holds a speed [rad/s] in steady state without load, by the controller's motor.
+
+    i_q = B_f w / k_t, i_d = 0;  u_q = R_s i_q + n_p w psi_f,  u_d = -n_p w L_q i_q
+    """
+    m = config.motor
+    i_q = m.B_f_n_m_s * w / (1.5 * m.n_p * m.psi_f_wb)
+    return math.hypot(m.R_s_ohm * i_q + m.n_p * w * m.psi_f_wb, m.n_p * w * m.L_q_h * i_q)
+
+
+def _speed(config: RunConfig, wire: WireFacts) -> Iterator[str]:
+    limits, w = config.limits, peak(config.reference)
+    if w > limits.w_max_rad_s:
+        w_max = f"limits.w_max_rad_s = {limits.w_max_rad_s:g}"
+        yield f"reference: reaches {w:g} rad/s, {w_max} stops it; take less"
+    most, needs = min(limits.u_max_v, wire.u_top), voltage_at(config, w)
+    if config.controller.kind != "fac" and needs > most:
+        yield (
+            f"reference: {w:g} rad/s takes {needs:.4g} V without load, there are {most:g} V "
+            "(limits.u_max_v, and what the frames carry); take a lower speed"
+        )
+
+
+def _voltage(config: RunConfig) -> Iterator[str]:
+    limits = config.limits
+    circle = limits.v_dc_max_v / math.sqrt(3.0)
+    if "v_dc_max_v" in limits.model_fields_set and limits.u_max_v > circle:
+        yield (
+            f"limits.u_max_v = {limits.u_max_v:g}: a DC link of v_dc_max_v = {limits.v_dc_max_v:g} V gives "
+            f"{circle:.4g} V (v_dc / sqrt 3); take less"
+        )
+
+
+def _tables(config: RunConfig) -> Iterator[tuple[str, dict[str, Any]]]:
+    yield "controller", config.controller.model_dump()
+    yield "observer.speed", config.observer.speed.model_dump()
+    yield "observer.current", config.observer.current.model_dump()
+
+
+def _poles(config: RunConfig) -> Iterator[str]:
+    """A pole past half the sampling frequency is none that a sampled law can have."""
+    most = math.pi * config.loop.rate_hz
+    for where, table in _tables(config):
+        for key, value in table.items():
+            if not key.endswith("_rad_s") or "noise" in key:
+                continue
+            for pole in value if isinstance(value, list) else [value]:
+                if pole is not None and pole > most:
+                    yield (
+                        f"{where}.{key} = {pole:g}: faster than half of loop.rate_hz = {config.loop.rate_hz} "
+                        f"({most:.4g} rad/s); take less, or a higher rate"
+                    )
+
+
+def _delays(config: RunConfig) -> Iterator[str]:
+    """A window is a whole number of periods."""
+    for where, table in _tables(config):
+        delay = table.get("delay_ms")
+        if delay is None or table.get("kind") == "dob":
+            continue
+        periods = delay * 1e-3 * config.loop.rate_hz
+        whole = max(1, round(periods))
+        if abs(periods - whole) > 1e-6 * whole:
+            yield (
+                f"{where}.delay_ms = {delay:g}: no whole number of periods at {config.loop.rate_hz} Hz; "
+                f"{whole * 1e3 / config.loop.rate_hz:g} ms is taken"
+            )
