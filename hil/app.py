@@ -40,6 +40,7 @@ from hil.loop import Loop, Outcome, Plan, StopRequest, no_whole
 from hil.ports import Drive
 from hil.progress import say, watching
 from hil.reachable import out_of_reach
+from hil.reasons import End, explain
 from hil.shadow import ShadowDrive
 from hil.shipped import log_base
 from hil.showable import check_limits
@@ -96,6 +97,8 @@ class RunResult:
     grants: list[realtime.Grant] = field(default_factory=list)
     processor_us: float = 0.0
     """Processor time of the loop's thread, per tick [us]."""
+    end: End | None = None
+    """Why it ended; None when it did not get so far."""
 
     @property
     def ok(self) -> bool:
@@ -110,6 +113,7 @@ class RunResult:
             "ticks": self.outcome.ticks,
             "skipped": self.outcome.skipped,
             "ended": Reason(self.outcome.reason).name.lower(),
+            "end": self.end.as_dict() if self.end else None,
             "dropped": self.dropped,
             "log_complete": self.complete,
             "processor_us": self.processor_us,
@@ -444,7 +448,7 @@ def _recorded(
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts)
             client.discard()
-            result = _run_armed(setup, loop, plan, recorder, clock, request, client.odd_length)
+            result = _run_armed(setup, machine, loop, plan, recorder, clock, request, client.odd_length)
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
         raise
@@ -478,6 +482,7 @@ def plan_of(config: RunConfig) -> Plan:
 
 def _run_armed(
     setup: Setup,
+    machine: Machine,
     loop: Loop,
     plan: Plan,
     recorder: Recorder,
@@ -513,10 +518,14 @@ def _run_armed(
             say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
         dropped = recorder.dropped
         ended = failure or Reason(outcome.reason).name.lower()
-        result = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
+        result: dict[str, Any] = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
+        stop = outcome.stop
+        end = None if stop is None else explain(machine.safety, machine.safety_state, stop[0])
+        if end is not None:
+            result["end"] = end.as_dict()
         complete = recorder.close(result)
     processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
-    return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us)
+    return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us, end)
 
 
 @contextlib.contextmanager

@@ -75,6 +75,7 @@ def summary(
         "skipped": result.outcome.skipped,
         "dropped": result.dropped,
         "ended": result.as_dict()["ended"],
+        "end": result.as_dict()["end"],
         "lateness_us": asdict(Lateness.of(ticks)),
         "tracking_rms_rad_s": tracking_rms(ticks),
         "dip_rad_s": step.dip if step else None,

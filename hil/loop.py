@@ -75,6 +75,8 @@ class Outcome:
     skipped: int = 0
     reason: int = 0
     state: int = 0
+    stop: TickArray | None = None
+    """The first tick with a reason."""
 
 
 def none_compiled(_k: int, _deadline_ns: int, _asked: int, _log_failed: bool) -> int:
@@ -247,6 +249,8 @@ class Loop:
         self._recorder.tick(self._ticks)
         t.recorded_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
         if t.reason[0]:
+            if self._outcome.stop is None:
+                self._outcome.stop = self._ticks.copy()
             self._outcome.state, self._outcome.reason = t.state[0], t.reason[0]
             self._ended = t.state[0] in ENDED
 

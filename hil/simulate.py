@@ -22,6 +22,7 @@ from firmware_model.node import wire_of
 from hil.app import Setup, header_of, log_path, needed_bytes, plan_of
 from hil.control.jit import jit
 from hil.control.law import FAC
+from hil.design import Machine
 from hil.emulate import load_plant
 from hil.errors import ConfigError
 from hil.kernel import prepare, step
@@ -29,6 +30,7 @@ from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
 from hil.log.split import SplitFile, open_run
 from hil.loop import transition_event
+from hil.reasons import explain
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.snapshot import StateFollower
 
@@ -115,6 +117,7 @@ class Simulation:
     plant: Record
     plant_state: Record
     stop_at: int
+    machine: Machine
 
     def blocks(self) -> Any:
         """Yield tick arrays of up to BLOCK ticks until the run has ended; each is overwritten by the next."""
@@ -133,7 +136,7 @@ class Simulation:
         self._into()(new_ticks(0), 0)
 
     def _into(self) -> Callable[[TickArray, int], int]:
-        machine, tick, out = self.setup.machine.fresh(), new_ticks(), new_sample()
+        machine, tick, out = self.machine, new_ticks(), new_sample()
         period_ns = self.setup.config.loop.period_ns
 
         def into(ticks: TickArray, k: int) -> int:
@@ -160,7 +163,7 @@ def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
     database = Database(folder / plant.dbc, plant.node_id)
     params = build_params(plant, wire_of(database, plant.protocol))
     state = new_state(params, setup.wire.counter_modulus - 1)
-    return Simulation(setup, params, state, ticks)
+    return Simulation(setup, params, state, ticks, setup.machine.fresh())
 
 
 def simulate_ticks(setup: Setup, plant_settings: list[str] | None = None) -> TickArray:
@@ -186,16 +189,20 @@ def simulate(
         file: RunFile | SplitFile | None = open_run(path, header, StateFollower) if log else None
         if file:
             stack.enter_context(file)
-        last, count = _through(simulation, file, seen or (lambda _: None))
+        last, count, stop = _through(simulation, file, seen or (lambda _: None))
         reason = Reason(int(last["reason"]))
+        machine = simulation.machine
+        end = None if stop is None else explain(machine.safety, machine.safety_state, stop)
+        why = {"end": end.as_dict()} if end else {}
         if file:
-            file.finish({"ended": reason.name.lower(), "ticks": count, "skipped": 0})
+            file.finish({"ended": reason.name.lower(), "ticks": count, "skipped": 0, **why})
     wall_s = time.perf_counter() - start
     simulated_s = count * setup.config.loop.period_ns * 1e-9
     return {
         "log": str(path) if log else None,
         "ticks": count,
         "ended": reason.name.lower(),
+        "end": end.as_dict() if end else None,
         "ok": reason == Reason.STOP_REQUESTED,
         "simulated_s": simulated_s,
         "wall_s": wall_s,
@@ -205,9 +212,12 @@ def simulate(
 
 def _through(
     simulation: Simulation, file: RunFile | SplitFile | None, seen: Callable[[int], None]
-) -> tuple[Any, int]:
-    """Run to the end, ticks and changes of state into the file; the last tick and how many there were."""
-    last, count, state = new_ticks()[0], 0, int(DriveState.SWITCH_ON_DISABLED)
+) -> tuple[Any, int, Any]:
+    """Run to the end, ticks and changes of state into the file.
+
+    Returns the last tick, how many there were, and the first with a reason, None for none.
+    """
+    last, count, state, stop = new_ticks()[0], 0, int(DriveState.SWITCH_ON_DISABLED), None
     for ticks in simulation.blocks():
         if file:
             for row in np.nonzero(np.diff(ticks["state"].astype(np.int64), prepend=state))[0]:
@@ -217,5 +227,7 @@ def _through(
             file.add_ticks(ticks)
         state = int(ticks["state"][-1])
         last, count = ticks[-1].copy(), count + len(ticks)
+        if stop is None and last["reason"]:
+            stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
         seen(count)
-    return last, count
+    return last, count, stop

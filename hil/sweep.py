@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from hil.app import Overrides, load_setup
+from hil.app import Overrides, Setup, load_setup
 from hil.demo import true_motor
 from hil.design import motor_model
 from hil.emulate import load_plant
 from hil.errors import ConfigError
 from hil.metrics import load_step, tracking_rms
-from hil.signals import Reason
+from hil.reasons import explain
+from hil.signals import Reason, TickArray
 from hil.simulate import simulate_ticks
 
 MOST_CASES = 10_000
@@ -65,6 +66,13 @@ def cases(sweep: Sequence[str], plant_sweep: Sequence[str]) -> list[Case]:
     return [Case(one[: len(own)], one[len(own) :]) for one in itertools.product(*own, *plant)]
 
 
+def _end(setup: Setup, ticks: TickArray) -> dict[str, Any] | None:
+    """Why a case ended; sums of the supervisor are not kept here."""
+    stopped = ticks[ticks["reason"] != 0]
+    end = explain(setup.machine.safety, None, stopped[0]) if len(stopped) else None
+    return end.as_dict() if end else None
+
+
 def run_case(path: Path, overrides: Overrides, plant_settings: list[str], case: Case) -> dict[str, Any]:
     """Simulate one case: its settings, how it ended, and the metrics of tracking and load step."""
     setup = load_setup(path, replace(overrides, settings=(*overrides.settings, *case.config)))
@@ -76,6 +84,7 @@ def run_case(path: Path, overrides: Overrides, plant_settings: list[str], case: 
     return {
         "case": [*case.config, *case.plant],
         "ended": Reason(int(ticks["reason"][-1])).name.lower(),
+        "end": _end(setup, ticks),
         "tracking_rms_rad_s": tracking_rms(ticks),
         "dip_rad_s": step.dip if step else None,
         "recovery_ms": step.recovery_ms if step else None,

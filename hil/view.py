@@ -68,6 +68,7 @@ def demo_table(result: dict[str, Any]) -> Table:
         )
         or "nothing asked (lockstep)",
         "ended": result["ended"],
+        **end_rows(result["end"]),
         "replay": verdict_text(replay),
         "log": result["log"],
     }
@@ -88,10 +89,18 @@ def verdict_text(replay: dict[str, Any]) -> str:
     return "; ".join([text, *([replay["why"]] if replay["why"] else []), *replay.get("notes", ())])
 
 
+def end_rows(end: dict[str, Any] | None) -> dict[str, str]:
+    """Why a run ended that nobody asked to end, and what to do."""
+    if end is None or end["reason"] in ("stop_requested", "quick_stop_requested"):
+        return {}
+    return {"why": end["text"], "what to do": end["remedy"]}
+
+
 def run_table(result: RunResult) -> Table:
     """What a run says at its end."""
     rows: dict[str, Any] = {
         "ended": Reason(result.outcome.reason).name.lower().replace("_", " "),
+        **end_rows(result.end.as_dict() if result.end else None),
         "ticks": f"{result.outcome.ticks}, {result.outcome.skipped} skipped",
         "records dropped": result.dropped,
     }

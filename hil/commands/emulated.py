@@ -53,7 +53,7 @@ def cmd_simulate(args: argparse.Namespace) -> int:
     """Simulate a config, or a sweep over it."""
     from hil.app import load_setup
     from hil.simulate import simulate
-    from hil.view import key_values, progress, show
+    from hil.view import end_rows, key_values, progress, show
 
     if args.sweep or args.plant_sweep:
         return _sweep(args)
@@ -67,7 +67,8 @@ def cmd_simulate(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result)
     else:
-        show(key_values("hil simulate", result))
+        rows = {key: value for key, value in result.items() if key != "end"}
+        show(key_values("hil simulate", rows | end_rows(result["end"])))
     return 0 if result["ok"] else EXIT_FAILED
 
 

@@ -40,6 +40,7 @@ class Report:
                     "ticks": run.totals.ticks,
                     "checks": [check.as_dict() for check in judge(run)],
                     "figures": figures(run),
+                    "end": run.end,
                     "replay": run.verdict.as_dict(),
                     "damage": run.log.damage,
                 }

@@ -13,6 +13,7 @@ from hil.config import RunConfig, validate
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
 from hil.log.reader import Log, Source, new_log, read_blocks
+from hil.reasons import explain
 from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
@@ -43,6 +44,9 @@ class Run:
     close_ups: CloseUps = field(default_factory=CloseUps)
     verdict: Verdict = field(default_factory=lambda: Verdict("cannot", 0, why="not asked for"))
     first_ns: int | None = None
+    stop: Any = None
+    """The first tick with a reason."""
+    _safety: Any = None
     _state: int = int(DriveState.SWITCH_ON_DISABLED)
 
     def feed(self, ticks: TickArray) -> None:
@@ -60,6 +64,8 @@ class Run:
         self.envelope.feed(t, values)
         self.close_ups.feed(t, values, sorted(steps + ends))
         self.totals.feed(t, ticks)
+        if self.stop is None and ticks["reason"].any():
+            self.stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
         self.phases.feed(ticks)
         self.spectrum.feed(ticks)
 
@@ -79,6 +85,7 @@ class Run:
         except (ConfigError, HilError) as error:
             self.config_problem = str(error)
         else:
+            self._safety = machine.safety
             windows = machine.law["N"][0]
             self.frame_time = frame_time(self.config)
             self.N = (int(windows[0]), int(windows[1]))
@@ -110,6 +117,17 @@ class Run:
     def ended(self) -> str:
         """How the run says that it ended."""
         return str(self.log.result.get("ended", "unknown: the log has no result"))
+
+    @property
+    def end(self) -> dict[str, Any] | None:
+        """Why it ended: as the log says, else from the first tick with a reason; None when neither tells."""
+        said = self.log.result.get("end")
+        if isinstance(said, dict) and {"reason", "text", "remedy"} <= said.keys():
+            return said
+        if self.stop is None or self._safety is None:
+            return None
+        found = explain(self._safety, None, self.stop)
+        return found.as_dict() if found else None
 
     def curves(self) -> tuple[F8, F4, F4]:
         """Times [s], minima and maxima of all curves."""

@@ -121,7 +121,9 @@ def ending(run: Run) -> str:
     if run.ended == "controller died":
         return f"the controller died, what it had handed over was still written{last}"
     if run.ended.upper() in Reason.__members__:
-        return f"the run ended in a trip, {run.ended.replace('_', ' ')}{last}"
+        end = run.end
+        why = f": {end['text']}; {end['remedy']}" if end else ""
+        return f"the run ended in a trip, {run.ended.replace('_', ' ')}{why}{last}"
     return f"the run ended: {run.ended}{last}"
 
 
