@@ -52,7 +52,7 @@ class Link(Protocol):
     """What the drive client and the emulator need of a bus."""
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
-        """Send a data frame. Raises LinkDown, QueueFull or LinkError."""
+        """Send a data frame. Raises LinkDown, QueueFull or LinkError; LinkError for what is no data frame."""
 
     def receive(self, timeout_ns: int) -> Frame | None:
         """Return the next frame, or None after ``timeout_ns`` (0: at once). Raises LinkError."""
@@ -93,6 +93,7 @@ class SocketLink:
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
+        check_data_frame(can_id)
         if fd and not self._fd:
             raise LinkError(
                 errno.EINVAL, "can't send a CAN FD frame: the bus is opened without fd; set bus.fd, or --fd"
@@ -160,6 +161,16 @@ def _closed(timeout: float | None = None, /) -> list[tuple[int, int]]:
     raise ValueError("closed")
 
 
+def check_data_frame(can_id: int) -> None:
+    """Raise LinkError for an identifier with the bit of an error or a remote frame: neither is a data frame.
+
+    Sent without that bit it would be one, of another meaning: error class 0x80 reads as SYNC.
+    """
+    if can_id & (RTR_FLAG | ERR_FLAG):
+        kind = "an error frame" if can_id & ERR_FLAG else "a remote frame"
+        raise LinkError(errno.EINVAL, f"can't send {can_id:08X}: it is {kind}; only data frames are sent")
+
+
 def _discard(link: Link) -> int:
     """Read until nothing is there; a flood can't hold the caller longer than the bound."""
     count = 0
@@ -192,6 +203,7 @@ class GenericLink:
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
+        check_data_frame(can_id)
         check_length(data, fd)
         message = can.Message(
             arbitration_id=can_id & 0x1FFFFFFF,
@@ -214,13 +226,9 @@ class GenericLink:
         if message is None:
             return None
         flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
-        flags |= ERR_FLAG if message.is_error_frame else 0
-        return Frame(
-            message.arbitration_id,
-            b"" if message.is_remote_frame else bytes(message.data),
-            flags,
-            message.is_fd,
-        )
+        flags = ERR_FLAG if message.is_error_frame else flags
+        data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data)
+        return Frame(message.arbitration_id, data, flags, message.is_fd)
 
     def discard(self) -> int:
         """Throw away what is queued."""

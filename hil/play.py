@@ -14,20 +14,23 @@ import math
 import os
 import signal
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final, Literal, NamedTuple, NoReturn, Protocol
 
-import can
 import numpy as np
 
+from hil.convert.readers.recorded import NOT_DATA
+from hil.convert.recording import Recording, kinds_of
 from hil.log.errors import LogError
 from hil.log.reader import Log, read_blocks
 from hil.signals import new_ticks
 
 Send = Callable[[int, bytes, bool], None]
 Direction = Literal["rx", "tx", "both"]
+ASKING: Final = "--recorded-channel"
 EXTENDED: Final = 0x80000000
 LATE_NS: Final = 1_000_000
 LEAD_NS: Final = 20_000_000
@@ -117,29 +120,53 @@ class Result:
 
 
 class Source:
-    """Frames of a log of hil (.mcap) or of a recording that python-can reads. Raises LogError."""
+    """Data frames of a log of hil (.mcap) or of another tool's recording. Raises LogError.
 
-    def __init__(self, path: Path) -> None:
+    Error and remote frames are never played: they are counted in ``left_out``. ``channel``, ``partial``: as
+    :class:`hil.convert.recording.Recording`; both are checked here, before anything is sent.
+    """
+
+    def __init__(self, path: Path, channel: str | None = None, *, partial: bool = False) -> None:
         if not path.is_file():
             raise LogError(f"{path}: no such file")
         self.path = path
         self.damage: str | None = None
-        self._ours = path.suffix.lower() == ".mcap"
-        self.roles_known, self._own_ids = self._roles() if self._ours else (False, frozenset())
+        self.left_out: dict[str, int] = {}
+        self._recording: Recording | None = None
+        self._own_ids: frozenset[int] = frozenset()
+        if path.suffix.lower() == ".mcap":
+            if channel is not None:
+                raise LogError(f"{path}: a log of hil holds one channel; leave {ASKING} out")
+            self._scan()
+        else:
+            self._recording = Recording(path, channel, partial, ASKING)
+            self.damage = self._recording.damage
+            self._leave_out(self._recording.identifiers)
+        self.roles_known = bool(self._own_ids)
 
-    def _roles(self) -> tuple[bool, frozenset[int]]:
-        """Identifiers that the controller itself sent; not known in the log of a shadow run."""
+    def _scan(self) -> None:
+        """Identifiers that the controller itself sent; none are known in the log of a shadow run."""
         own: set[int] = set()
+        seen: Counter[int] = Counter()
         log = Log(self.path, new_ticks(0))
         for block in read_blocks(log):
             if block.kind == "frames":
                 own.update(np.unique(block.records["can_id"][block.records["received"] == 0]).tolist())
+                numbers, counts = np.unique(block.records["can_id"], return_counts=True)
+                seen.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
         self.damage = log.damage
-        return bool(own), frozenset(own)
+        self._own_ids = frozenset(can_id for can_id in own if not can_id & NOT_DATA)
+        self._leave_out(seen)
+
+    def _leave_out(self, seen: Counter[int]) -> None:
+        kinds = kinds_of(seen)
+        self.left_out = {
+            f"{kind} frames left out": kinds[kind] for kind in ("error", "remote") if kinds[kind]
+        }
 
     def frames(self) -> Iterator[Played]:
-        """All frames in their order."""
-        return self._of_log() if self._ours else self._of_recording()
+        """All data frames in their order."""
+        return self._of_log() if self._recording is None else self._of_recording(self._recording)
 
     def _of_log(self) -> Iterator[Played]:
         for block in read_blocks(Log(self.path, new_ticks(0))):
@@ -149,19 +176,14 @@ class Source:
             for at, (t_ns, can_id, received, size) in enumerate(
                 block.records[["t_ns", "can_id", "received", "size"]].tolist()
             ):
-                command = not received or can_id in self._own_ids
-                yield Played(t_ns, can_id, raw[at * 64 : at * 64 + size], size > 8, command)
+                if not can_id & NOT_DATA:
+                    command = not received or can_id in self._own_ids
+                    yield Played(t_ns, can_id, raw[at * 64 : at * 64 + size], size > 8, command)
 
-    def _of_recording(self) -> Iterator[Played]:
-        try:
-            with can.LogReader(self.path) as reader:
-                for m in reader:
-                    if not (m.is_error_frame or m.is_remote_frame):
-                        can_id = m.arbitration_id | (EXTENDED if m.is_extended_id else 0)
-                        t_ns = round(m.timestamp * 1e9)
-                        yield Played(t_ns, can_id, bytes(m.data), m.is_fd, not m.is_rx)
-        except (ValueError, OSError, NotImplementedError, ArithmeticError) as error:
-            raise LogError(f"{self.path}: can't be read as a recording: {error}") from error
+    def _of_recording(self, recording: Recording) -> Iterator[Played]:
+        for t_ns, _, can_id, received, fd, data in recording.frames():
+            if not can_id & NOT_DATA:
+                yield Played(t_ns, can_id, data, fd, not received)
 
 
 def play(

@@ -25,12 +25,14 @@ def register(commands: Commands) -> None:
     command = commands.add(
         "import",
         cmd_import,
-        "Write REC, a recording of the bus (candump .log, .blf, .asc, .mf4), as a log of CONFIG's controller",
+        "Write REC, a recording of the bus (candump .log, .asc, .blf, .mf4, .trc), "
+        "as a log of CONFIG's controller",
     )
     command.add_argument("recording", type=Path, metavar="REC", help="a recording of frames")
     command.add_argument("-o", "--output", type=Path, metavar="LOG", required=True, help="an MCAP file")
     command.add_argument("--config", type=Path, metavar="CONFIG", required=True, help="run configuration")
     command.add_argument("--channel", metavar="NAME", help="the recording's channel, where it has several")
+    command.add_argument("--partial", action="store_true", help="take what can be read of a damaged one")
     command.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as hil run's")
     command.add_argument("--force", action="store_true", help="replace LOG when it exists")
 
@@ -53,9 +55,8 @@ def cmd_import(args: argparse.Namespace) -> int:
     from hil.convert.importing import import_recording
     from hil.view import key_values, show
 
-    found = import_recording(
-        args.recording, args.output, args.config, tuple(args.set), channel=args.channel, force=args.force
-    ).as_dict()
+    options = {"channel": args.channel, "force": args.force, "partial": args.partial}
+    found = import_recording(args.recording, args.output, args.config, tuple(args.set), **options).as_dict()
     if args.json:
         print_json(found)
     else:

@@ -21,7 +21,7 @@ def register(commands: Commands) -> None:
     command = commands.add(
         "play",
         cmd_play,
-        "Send the frames of LOG with their timing. By default only what the drive sent.",
+        "Send the data frames of LOG with their timing. By default only what the drive sent.",
     )
     command.add_argument("log", type=Path, metavar="LOG", help=".mcap of hil, or .log .asc .blf .mf4 ...")
     bus = command.add_argument_group("bus (as python-can)")
@@ -40,6 +40,8 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "--direction", choices=("rx", "tx", "both"), default="rx", help="rx: what the drive sent (default)"
     )
+    command.add_argument("--recorded-channel", metavar="NAME", help="the recording's, where it has several")
+    command.add_argument("--partial", action="store_true", help="play what can be read of a recording")
     command.add_argument(
         "--paused", action="store_true", help="start paused; n sends one frame, space goes on and pauses"
     )
@@ -84,7 +86,7 @@ def cmd_play(args: argparse.Namespace) -> int:
 
     if not 0.0 <= args.from_s <= args.to_s:
         raise HilError(f"--from {args.from_s:g} --to {args.to_s:g}: no such window")
-    source = Source(args.log)
+    source = Source(args.log, args.recorded_channel, partial=args.partial)
     choice = Choice(args.direction, frozenset(args.id), frozenset(args.not_id), args.from_s, args.to_s)
     only_drive = source.roles_known and args.direction == "rx"
     allowed = only_drive or (args.transmit_commands and _confirmed(args))
@@ -96,7 +98,7 @@ def cmd_play(args: argparse.Namespace) -> int:
         result = play(rounds, send, RealClock(), rate=args.rate, before=before)
     if not (result.sent or result.interrupted):
         raise LogError(f"{args.log}: no frame was chosen; see --direction, --id, --from and --to")
-    found = result.as_dict() | ({"log": source.damage} if source.damage else {})
+    found = result.as_dict() | source.left_out | ({"log": source.damage} if source.damage else {})
     if args.json:
         print_json(found)
     else:

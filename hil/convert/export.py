@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
-import can
 import numpy as np
 
-from hil.convert.recordings import Candump, Mf4Recording, Vector
+from hil.convert.recordings import Asc, Blf, Candump, Mf4Recording
 from hil.convert.tables import CsvTable, MatTable, Mf4Table, ParquetTable
 from hil.log.errors import LogError
 from hil.log.reader import Log, Source, new_log, read_blocks
@@ -41,8 +40,8 @@ FORMATS: Final[dict[str, tuple[Literal["ticks", "frames"], Open]]] = {
     ".mat": ("ticks", MatTable),
     ".mf4": ("ticks", Mf4Table),
     ".log": ("frames", lambda path, log: Candump(path, log, "can0")),
-    ".asc": ("frames", lambda path, log: Vector(can.ASCWriter(path), log)),
-    ".blf": ("frames", lambda path, log: Vector(can.BLFWriter(path), log)),
+    ".asc": ("frames", Asc),
+    ".blf": ("frames", Blf),
 }
 
 

@@ -16,10 +16,9 @@ within a stretch of held commands, and in a listener's recording at the tick tha
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,9 +26,9 @@ import numpy as np
 
 from hil.app import Overrides, Setup, header_of, load_setup
 from hil.convert.export import replacing
-from hil.convert.periods import HELD_PERIODS, MERGE_PERIODS, Heard, periods
+from hil.convert.periods import HELD_PERIODS, MERGE_PERIODS, Heard, Steady, periods
+from hil.convert.readers.recorded import ERROR, EXTENDED, ID_MASK, REMOTE
 from hil.convert.recording import Recording
-from hil.convert.recordings import ID_MASK
 from hil.convert.rerun import Run
 from hil.convert.search import NotOursError, Search
 from hil.log.errors import LogError
@@ -40,6 +39,7 @@ from hil.loop import transition_event
 from hil.signals import TICK, DriveState, Reason, RxFlag
 
 BLOCK: Final = 2048
+PAUSE_NS: Final = 1_000_000_000
 OURS: Final = "the commands are this controller's, to the bit"
 THEIRS: Final = "open loop: another controller's commands, this one only computes"
 
@@ -56,6 +56,7 @@ class Imported:
     ended: str
     set_right: int
     damage: str | None
+    notes: list[str]
 
     def as_dict(self) -> dict[str, Any]:
         """As a plain dict."""
@@ -111,16 +112,25 @@ def import_recording(
     *,
     channel: str | None = None,
     force: bool = False,
+    partial: bool = False,
 ) -> Imported:
-    """Write the recording ``source`` as the log ``out``. Raises HilError for what can't be imported."""
-    if not source.is_file():
-        raise LogError(f"{source}: no such file")
+    """Write the recording ``source`` as the log ``out``. Raises HilError for what can't be imported.
+
+    ``channel``, ``partial``: as :class:`hil.convert.recording.Recording`.
+    """
     if out.suffix.lower() != ".mcap":
         raise LogError(f"{out}: a log ends in .mcap")
     setup = load_setup(config, Overrides(settings=settings))
+    recording = Recording(source, channel, partial)
+    period_ns = setup.config.loop.period_ns
+    if recording.step_ns > period_ns:
+        raise LogError(
+            f"{source}: its stamps go in steps of {recording.step_ns * 1e-6:g} ms, longer than the period of "
+            f"{period_ns * 1e-6:g} ms: single ticks can't be told apart; record with finer stamps"
+        )
     with replacing(out, force=force) as part:
         try:
-            return _carry(setup, Recording(source, channel), part, out)
+            return _carry(setup, recording, part, out)
         except NotOursError as why:
             part.unlink(missing_ok=True)
             if setup.config.controller.kind == "fac":
@@ -128,49 +138,84 @@ def import_recording(
                     f"{source}: {why}; and controller.kind fac can't judge another's commands"
                 ) from why
             shadow = load_setup(config, Overrides(settings=(*settings, "loop.shadow=true")))
-            return _carry(shadow, Recording(source, channel), part, out, f" ({why})")
+            return _carry(shadow, recording, part, out, f" ({why}{_pause(recording)})")
+
+
+def _pause(recording: Recording) -> str:
+    """The longest time without a frame, where it may be why the commands do not fit."""
+    longest_ns, at_ns = recording.longest
+    if longest_ns < PAUSE_NS:
+        return ""
+    return f"; its stamps jump by {longest_ns * 1e-9:.3f} s at {at_ns * 1e-9:.6f} s"
 
 
 def _carry(setup: Setup, recording: Recording, part: Path, out: Path, why: str = "") -> Imported:
     """One pass over the recording; ``why``: what this controller was found not to have sent."""
-    run, frames = Run(setup), recording.frames()
+    run, loop = Run(setup), setup.config.loop
     merge = MERGE_PERIODS if run.shadow else HELD_PERIODS
-    first = next(frames, None)
-    if first is None:
-        raise LogError(f"{recording.path}: {recording.damage or 'has no frames'}{_other_channels(recording)}")
     commands = (THEIRS if run.shadow else OURS) + why
     with RunFile(part, _header(setup, recording, commands)) as file:
         output = Output(file)
-        loop = setup.config.loop
-        passing = output.passing(itertools.chain([first], frames))
-        found = periods(passing, run.roles, loop.timeout_ns, loop.period_ns, merge)
-        for ticks in Search(run).ticks(found):
+        passing = output.passing(recording.heard())
+        steady = Steady(periods(passing, run.roles, loop.timeout_ns, loop.period_ns, merge))
+        for ticks in Search(run).ticks(steady.periods()):
             output.tick(ticks)
+        _check_jump(recording, steady, run)
         for _ in passing:
             pass  # what comes after the run is kept as frames
-        count = output.ticks
         _check(recording, run, output)
         output.flush()
         ended = Reason(int(run.ticks["reason"][0])).name.lower() if run.over else "the recording ends here"
-        file.add_event(output.last_ns, max(count - 1, 0), "import", f"{recording.path.name}: {commands}")
-        if recording.damage:
-            file.add_event(output.last_ns, max(count - 1, 0), "damage", recording.damage)
-        file.finish({"ended": ended, "ticks": count, "skipped": output.skipped, "commands": commands})
-    skipped, right = output.skipped, recording.set_right
-    return Imported(str(out), count, skipped, recording.count, commands, ended, right, recording.damage)
+        _finish(file, output, recording, commands, ended)
+    return Imported(
+        str(out),
+        output.ticks,
+        output.skipped,
+        recording.count,
+        commands,
+        ended,
+        recording.set_right,
+        recording.damage,
+        recording.notes,
+    )
 
 
-def _other_channels(recording: Recording) -> str:
-    return f"; channels there are {recording.channels}" if recording.channel is not None else ""
+def _finish(file: RunFile, output: Output, recording: Recording, commands: str, ended: str) -> None:
+    """What the log says of where it comes from."""
+    at = output.last_ns, max(output.ticks - 1, 0)
+    file.add_event(*at, "import", f"{recording.path.name}: {commands}")
+    for kind, texts in (("damage", filter(None, [recording.damage])), ("note", recording.notes)):
+        for text in texts:
+            file.add_event(*at, kind, text)
+    totals = {"ticks": output.ticks, "skipped": output.skipped, "commands": commands}
+    file.finish({"ended": ended, **totals})
+
+
+def _check_jump(recording: Recording, steady: Steady, run: Run) -> None:
+    """A run does not go on after a minute without a tick: the recorder's clock was set. Raises LogError."""
+    if steady.jump is None or run.over:
+        return
+    before_ns, after_ns = steady.jump
+    raise LogError(
+        f"{recording.path}: time jumps by {(after_ns - before_ns) * 1e-9:.3f} s in the middle of a run, "
+        f"from {before_ns * 1e-9:.6f} s to {after_ns * 1e-9:.6f} s after its first frame; cut it there"
+    )
+
+
+def named(can_id: int) -> str:
+    """An identifier with its kind: ``181``, or ``181x (29 bits)``; of an error frame its class."""
+    text = f"{can_id & ID_MASK:X}" + ("x (29 bits)" if can_id & EXTENDED else "")
+    kind = " (error frame)" if can_id & ERROR else " (remote frame)" if can_id & REMOTE else ""
+    return text + kind
 
 
 def _check(recording: Recording, run: Run, output: Output) -> None:
     """A recording without a tick or a measurement is of another bus. Raises LogError."""
     if output.fresh:
         return
-    seen = ", ".join(f"{can_id & ID_MASK:X}" for can_id in sorted(recording.identifiers)[:20])
-    measured = ", ".join(f"{can_id & ID_MASK:X}" for can_id in sorted(run.roles.measuring))
-    sync = "" if run.roles.sync is None else f", SYNC {run.roles.sync & ID_MASK:X}"
+    seen = ", ".join(map(named, sorted(recording.identifiers)[:20]))
+    measured = ", ".join(map(named, sorted(run.roles.measuring)))
+    sync = "" if run.roles.sync is None else f", SYNC {named(run.roles.sync)}"
     damage = f"; {recording.damage}" if recording.damage else ""
     raise LogError(
         f"{recording.path}: no valid feedback among {recording.count} frames; wanted identifiers: "
@@ -181,6 +226,10 @@ def _check(recording: Recording, run: Run, output: Output) -> None:
 def _header(setup: Setup, recording: Recording, commands: str) -> dict[str, Any]:
     """The header of a run's log, with what it is made from."""
     header = header_of(setup, "import", "recording")
-    started = datetime.fromtimestamp(recording.start_us * 1e-6, UTC).isoformat()
-    header["metadata"] |= {"started": started, "recording": recording.path.name, "commands": commands}
+    started = datetime.fromtimestamp(0, UTC) + timedelta(microseconds=recording.start_ns // 1000)
+    header["metadata"] |= {
+        "started": started.isoformat(),
+        "recording": recording.path.name,
+        "commands": commands,
+    }
     return header

@@ -23,6 +23,8 @@ HELD_PERIODS: Final = 1000
 GAPS_MOST: Final = 100
 """So many gaps are tried between those that the stamps leave open; over 64 periods none is like another."""
 MOST_NS: Final = 2**31 - 1
+JUMP_NS: Final = 60_000_000_000
+"""A drive, its controller or its recorder is long stopped when nothing of a run came for so long."""
 
 
 class Heard(NamedTuple):
@@ -79,6 +81,27 @@ class Period:
         """Take a frame of the controller."""
         self.commands.append(frame)
         self.sent_ns = frame.t_ns
+
+
+@dataclass(slots=True)
+class Steady:
+    """Periods up to a jump of the recorder's clock: none of a run comes a minute after another.
+
+    ``jump``: the stamps before and after it [ns]; None when there was none among what was asked for.
+    """
+
+    found: Iterable[Period]
+    jump: tuple[int, int] | None = None
+
+    def periods(self) -> Iterator[Period]:
+        """The periods."""
+        last_ns: int | None = None
+        for period in self.found:
+            if last_ns is not None and period.t_ns - last_ns > JUMP_NS:
+                self.jump = last_ns, period.t_ns
+                return
+            yield period
+            last_ns = period.t_ns
 
 
 class Whose(NamedTuple):

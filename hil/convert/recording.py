@@ -1,105 +1,177 @@
-"""A recording of a bus in another tool's format, frame by frame.
+"""A recording of a bus in another tool's format: gone through once to see if it can be trusted, then read.
 
-Reads by python-can's readers. What they raise for damaged bytes ends the recording there and is named; what
-is no recording at all is refused.
+The first pass counts frames and kinds, channels, stamps and what can't be read, so that whatever is refused
+is refused before anything is written or sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import gzip
+import io
+import zlib
+from array import array
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Final
 
-import can
+import numpy as np
 
-from hil.convert.frame import MissingPackage
 from hil.convert.periods import Heard
-from hil.convert.recordings import ERROR, EXTENDED, REMOTE
+from hil.convert.readers import asc, candump, library, mf4, trc
+from hil.convert.readers.recorded import ERROR, REMOTE, Found, NotThisFormatError, Recorded
 from hil.log.errors import LogError
 
-READERS: Final[dict[str, Callable[[Path], Any]]] = {
-    ".log": can.CanutilsLogReader,
-    ".asc": can.ASCReader,
-    ".blf": can.BLFReader,
-    ".mf4": can.MF4Reader,
-}
+TEXTS: Final = {".log": candump.read, ".asc": asc.read, ".trc": trc.read}
+BINARIES: Final = {".blf": library.read_blf, ".mf4": mf4.read}
+TABLES: Final = (".csv", ".db")
+"""python-can's own two, by python-can."""
+ENDINGS: Final = (*TEXTS, *BINARIES, *TABLES, *(f"{ending}.gz" for ending in (*TEXTS, *BINARIES)))
+UNORDERED: Final = frozenset(BINARIES)
+"""Formats whose loggers write buffer by buffer; in the others a stamp that goes back is a fault."""
 BACK_NS: Final = 1_000_000
 """A stamp that is before its predecessor's by less than this is taken as that: rounding, two buffers."""
+FEW: Final = 100
+"""So many frames tell in which steps a recorder's clock goes."""
+
+
+def ending_of(path: Path) -> str:
+    """The ending that names the format, .gz left out. Raises LogError."""
+    name = path.name.lower()
+    ending = Path(name.removesuffix(".gz")).suffix
+    if not name.endswith(ENDINGS):
+        raise LogError(f"{path}: a recording ends in one of {' '.join(ENDINGS)}")
+    return ending
+
+
+def kinds_of(identifiers: Counter[int]) -> dict[str, int]:
+    """How many data, remote and error frames there are among those with such identifiers."""
+    kinds = {"data": 0, "remote": 0, "error": 0}
+    for can_id, count in identifiers.items():
+        kinds["error" if can_id & ERROR else "remote" if can_id & REMOTE else "data"] += count
+    return kinds
 
 
 @dataclass(slots=True)
 class Recording:
-    """A recording's file and, while :meth:`frames` goes through it, what was found of it.
+    """A recording's file and what it holds. Raises LogError for what can't be read, or not be trusted.
 
-    ``channel``: only frames of that one; without it the file must hold a single one.
+    ``channel``: only frames of that one; without it the file must hold a single one. ``partial``: take what
+    there is of a recording of which a part can't be read. ``asking``: the option that names a channel.
+    ``step_ns``: the steps in which its clock goes, 0 when too few frames tell; ``longest``: the longest time
+    without a frame, and after which time from the first.
     """
 
     path: Path
     channel: str | None = None
-    start_us: int = 0
+    partial: bool = False
+    asking: str = "--channel"
+    start_ns: int = 0
     count: int = 0
     set_right: int = 0
+    step_ns: int = 0
+    longest: tuple[int, int] = (0, 0)
     damage: str | None = None
-    identifiers: dict[int, int] = field(default_factory=dict)
-    _channels: set[str] = field(default_factory=set)
-    _last_us: int = 0
+    notes: list[str] = field(default_factory=list)
+    identifiers: Counter[int] = field(default_factory=Counter)
+    channels: Counter[str] = field(default_factory=Counter)
+    _ordered: bool = True
 
-    def frames(self) -> Iterator[Heard]:
-        """Every frame in the order of the file. Raises LogError."""
-        for message in self._messages():
-            if self._is_ours(message):
-                yield self._heard(message)
+    def __post_init__(self) -> None:
+        if not self.path.is_file():
+            raise LogError(f"{self.path}: no such file")
+        found, stamps = Found(), array("q")
+        for one in self._read(found):
+            self.channels[one.channel] += 1
+            if self.channel in (None, one.channel):
+                stamps.append(one.t_ns)
+                self.identifiers[one.can_id] += 1
+        self._check_found(found)
+        self.count, self.start_ns = len(stamps), min(stamps) if self._unordered else stamps[0]
+        self._check_times(np.frombuffer(stamps, np.int64))
 
-    def _messages(self) -> Iterator[Any]:
-        """The messages of the file, as far as its reader comes."""
-        opened = READERS.get(self.path.suffix.lower())
-        if opened is None:
-            raise LogError(f"{self.path}: a recording ends in one of {' '.join(sorted(READERS))}")
-        try:
-            with opened(self.path) as reader:
-                yield from reader
-        except (ImportError, NotImplementedError) as error:
-            raise MissingPackage(f"reading {self.path.suffix} needs asammdf: {error}") from error
-        except OSError as error:
-            raise LogError(f"{self.path}: can't be read: {error.strerror or error}") from error
-        except Exception as error:  # noqa: BLE001 - another program's parser may raise anything on bad bytes
-            self.damage = f"can't be read on after frame {self.count}: {error or type(error).__name__}"
+    def frames(self) -> Iterator[Recorded]:
+        """Every frame of the channel, in the order of time."""
+        mine = (one for one in self._read(Found()) if self.channel in (None, one.channel))
+        yield from mine if self._ordered else sorted(mine, key=lambda one: one.t_ns)
 
-    def _is_ours(self, message: Any) -> bool:
-        """Whether a message is of the channel that is wanted. Raises LogError when that is not clear."""
-        name = str(message.channel)
-        self._channels.add(name)
-        if self.channel is not None:
-            return name == self.channel
-        if len(self._channels) > 1:
-            names = ", ".join(sorted(self._channels))
-            raise LogError(f"{self.path}: holds several channels ({names}, ...); name one with --channel")
-        return True
-
-    def _heard(self, message: Any) -> Heard:
-        """A message as a frame. Raises LogError for a time that goes back."""
-        t_us = round(message.timestamp * 1e6)
-        if self.count == 0:
-            self.start_us = self._last_us = t_us
-        if t_us < self._last_us:
-            back_us = self._last_us - t_us
-            if back_us * 1000 > BACK_NS:
-                raise LogError(
-                    f"{self.path}: time goes back by {back_us * 1e-6:.6f} s at frame {self.count}; "
-                    "cut the recording there"
-                )
-            self.set_right += 1
-        self._last_us = t_us = max(t_us, self._last_us)
-        can_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-        can_id |= (REMOTE if message.is_remote_frame else 0) | (ERROR if message.is_error_frame else 0)
-        self.count += 1
-        if can_id in self.identifiers or len(self.identifiers) < 1000:
-            self.identifiers[can_id] = self.identifiers.get(can_id, 0) + 1
-        data = b"" if message.is_remote_frame else bytes(message.data)
-        return Heard((t_us - self.start_us) * 1000, can_id, bool(message.is_rx), bool(message.is_fd), data)
+    def heard(self) -> Iterator[Heard]:
+        """The same with times from the first frame on, none before its predecessor's."""
+        last_ns = self.start_ns
+        for t_ns, _, can_id, received, fd, data in self.frames():
+            last_ns = max(last_ns, t_ns)
+            yield Heard(last_ns - self.start_ns, can_id, received, fd, data)
 
     @property
-    def channels(self) -> str:
-        """The channels that were seen, in words."""
-        return ", ".join(sorted(self._channels)) or "none"
+    def _unordered(self) -> bool:
+        return ending_of(self.path) in UNORDERED
+
+    def _read(self, found: Found) -> Iterator[Recorded]:
+        ending = ending_of(self.path)
+        try:
+            if ending in TABLES:
+                yield from library.read_table(self.path, found)
+            elif ending in TEXTS:
+                with _unpacked(self.path) as file, io.TextIOWrapper(file, "utf-8", "replace") as text:
+                    yield from TEXTS[ending](text, found)
+            else:
+                with _unpacked(self.path) as file:
+                    yield from BINARIES[ending](file, found)
+        except NotThisFormatError as error:
+            raise LogError(f"{self.path}: {error}") from error
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            found.cut = (
+                f"the compressed file is damaged or cut off after {found.places} {found.unit}: {error}"
+            )
+        except OSError as error:
+            raise LogError(f"{self.path}: can't be read: {error.strerror or error}") from error
+
+    def _check_found(self, found: Found) -> None:
+        """Raise LogError without frames, without a clear channel, for damage that nobody allowed."""
+        self.damage, self.notes = found.damage, [f"{count} {what}" for what, count in found.notes.items()]
+        counted = ", ".join(f"{name}: {count} frames" for name, count in sorted(self.channels.items()))
+        if self.damage and not (self.partial and self.channels):
+            there = sum(self.channels.values())
+            remedy = f"; --partial takes the {there} frames that there are" if there else ""
+            raise LogError(f"{self.path}: {self.damage}{remedy}")
+        if not self.channels:
+            raise LogError(f"{self.path}: has no frames")
+        if self.channel is None and len(self.channels) > 1:
+            raise LogError(f"{self.path}: holds several channels ({counted}); name one with {self.asking}")
+        if not self.identifiers:
+            raise LogError(f"{self.path}: has no frames of channel {self.channel}; there are {counted}")
+
+    def _check_times(self, stamps: np.ndarray) -> None:
+        """Note the steps of the stamps and what goes back. Raises LogError for a clock that was set back."""
+        steps = np.diff(stamps)
+        self.step_ns = int(np.gcd.reduce(steps)) if len(stamps) >= FEW else 0
+        if len(steps):
+            self.longest = int(steps.max()), int(stamps[steps.argmax()]) - self.start_ns
+        back = np.flatnonzero(steps < 0)
+        if not len(back):
+            return
+        worst = int(steps.min())
+        if self._unordered:
+            self._ordered = False
+            self.notes.append(
+                f"{len(back)} times the stamps go back, by {-worst * 1e-9:g} s at most: ordered by time"
+            )
+            return
+        if -worst > BACK_NS:
+            raise LogError(
+                f"{self.path}: time goes back by {-worst * 1e-9:.6f} s at frame {int(steps.argmin()) + 1}; "
+                "cut the recording there"
+            )
+        self.set_right = int((stamps < np.maximum.accumulate(stamps)).sum())
+
+
+def _unpacked(path: Path) -> IO[bytes]:
+    """The file's bytes; a compressed one goes through memory where its reader seeks."""
+    if path.suffix.lower() != ".gz":
+        return path.open("rb")
+    stream = gzip.open(path, "rb")  # noqa: SIM115 - the caller closes it
+    if ending_of(path) in TEXTS:
+        return stream  # type: ignore[return-value]
+    with stream:
+        return io.BytesIO(stream.read())

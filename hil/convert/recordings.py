@@ -1,5 +1,6 @@
 """Frames into recordings of the bus: candump, ASC, BLF, MF4. Times are the log's, set off to its start.
 
+An error frame stays one, with its class and its data, a remote frame stays one, with the length it asks for.
 A frame of more than 8 bytes is a CAN FD frame; a log does not keep whether a shorter one was.
 """
 
@@ -9,16 +10,17 @@ import re
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import can
 import numpy as np
 
 from hil.convert.frame import need
+from hil.convert.readers.asc import ERROR_COMMENT, START_COMMENT
+from hil.convert.readers.recorded import ERROR, EXTENDED, ID_MASK, REMOTE
 from hil.log.reader import Log
 from hil.log.schema import Records
 
-EXTENDED, REMOTE, ERROR, ID_MASK = 0x80000000, 0x40000000, 0x20000000, 0x1FFFFFFF
 _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,15}")
 
 
@@ -59,9 +61,7 @@ class Candump(_Recording):
         lines, channel = [], self._channel
         raw = frames["data"].tobytes().hex().upper()
         for at, (t_us, can_id, received, size) in enumerate(self._rows(frames)):
-            number = f"{can_id & ID_MASK:08X}" if can_id & EXTENDED else f"{can_id & 0x7FF:03X}"
-            data = raw[at * 128 : at * 128 + 2 * size]
-            body = f"{number}##1{data}" if size > 8 else f"{number}#{'R' if can_id & REMOTE else data}"
+            body = candump_body(can_id, size, raw[at * 128 : at * 128 + 2 * size])
             stamp, way = f"({t_us // 1000000}.{t_us % 1000000:06d})", "R" if received else "T"
             lines.append(f"{stamp} {channel} {body} {way}\n")
         self._file.write("".join(lines))
@@ -71,27 +71,100 @@ class Candump(_Recording):
         self._file.close()
 
 
-class Vector(_Recording):
-    """ASC or BLF by python-can's writer."""
+def candump_body(can_id: int, size: int, data: str) -> str:
+    """Identifier and data of a frame as candump -l writes them; ``data`` in hexadecimal digits."""
+    if can_id & ERROR:
+        return f"{can_id & (ERROR | ID_MASK):08X}#{data}"
+    number = f"{can_id & ID_MASK:08X}" if can_id & EXTENDED else f"{can_id & 0x7FF:03X}"
+    if can_id & REMOTE:
+        return f"{number}#R{size or ''}"
+    return f"{number}##1{data}" if size > 8 else f"{number}#{data}"
 
-    def __init__(self, writer: Any, log: Log) -> None:
+
+_DAYS: Final = ["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"]
+_MONTHS: Final = ["Jan", "Feb", "Mar", "Apr", "May", "Jun", "Jul", "Aug", "Sep", "Oct", "Nov", "Dec"]
+_FD_ROW: Final = "CANFD   1 {way:<4} {number:>8}  {name:>32} 1 0 {dlc:x} {size:>2} {data} {zeros}"
+_FD_ZEROS: Final = "       0    0     3000        0        0        0        0        0"
+"""Duration, length, flags (CAN FD with bit rate switch), CRC and bit timings of a CAN FD frame."""
+
+
+def asc_date(t_us: int) -> str:
+    """Local time as Vector's tools write it, in English whatever the locale, with three digits of ms."""
+    date = datetime.fromtimestamp(t_us // 1_000_000).astimezone()
+    day, month = _DAYS[date.weekday()], _MONTHS[date.month - 1]
+    return f"{day} {month} {date.day:02d} {date:%H:%M:%S}.{t_us // 1000 % 1000:03d} {date.year}"
+
+
+class Asc(_Recording):
+    """Vector's ASC in python-can's layout.
+
+    Written here: python-can 4.6.1 writes 45 ms as ".45", and day and month in the process's locale. What the
+    format has no place for stands in comments: the start to the microsecond, an error's class and data.
+    """
+
+    def __init__(self, path: Path, log: Log) -> None:
         super().__init__(log)
-        self._writer = writer
+        self._file = path.open("w", encoding="ascii", newline="\n")
+        date, start_us = asc_date(self._start_us), self._start_us
+        self._file.write(
+            f"date {date}\nbase hex  timestamps absolute\ninternal events logged\n"
+            f"{START_COMMENT}{start_us // 1_000_000}.{start_us % 1_000_000:06d} s since 1970\n"
+            f"Begin Triggerblock {date}\n 0.000000 Start of measurement\n"
+        )
+
+    def add(self, frames: Records) -> None:
+        """Append frames as lines."""
+        raw = frames["data"].tobytes()
+        rows = enumerate(self._rows(frames))
+        self._file.writelines(
+            self._line(t_us - self._start_us, can_id, received, raw[at * 64 : at * 64 + size])
+            for at, (t_us, can_id, received, size) in rows
+        )
+
+    @staticmethod
+    def _line(t_us: int, can_id: int, received: int, raw: bytes) -> str:
+        stamp = f"{t_us // 1_000_000: d}.{t_us % 1_000_000:06d}".rjust(9)
+        if can_id & ERROR:
+            told = candump_body(can_id, len(raw), raw.hex().upper())
+            return f"{ERROR_COMMENT}{told}\n{stamp} 1  ErrorFrame\n"
+        way, data, size = "Rx" if received else "Tx", raw.hex(" ").upper(), len(raw)
+        number = f"{can_id & ID_MASK:X}{'x' if can_id & EXTENDED else ''}"
+        if size > 8 and not can_id & REMOTE:
+            fd = {"number": number, "name": "", "dlc": _DLC[size], "size": size, "data": data}
+            return f"{stamp} {_FD_ROW.format(way=way, zeros=_FD_ZEROS, **fd)}\n"
+        body = f"r {size:x} " if can_id & REMOTE else f"d {size:x} {data}"
+        return f"{stamp} 1  {number:<15} {way:<4} {body}\n"
+
+    def close(self, *, whole: bool) -> None:
+        """Finish the file."""
+        with self._file:
+            self._file.write("End TriggerBlock\n" if whole else "")
+
+
+class Blf(_Recording):
+    """BLF by python-can's writer."""
+
+    def __init__(self, path: Path, log: Log) -> None:
+        super().__init__(log)
+        self._writer = can.BLFWriter(path)
 
     def add(self, frames: Records) -> None:
         """Append frames as messages."""
         raw, put = frames["data"].tobytes(), self._writer.on_message_received
         for at, (t_us, can_id, received, size) in enumerate(self._rows(frames)):
+            error, remote = bool(can_id & ERROR), bool(can_id & REMOTE)
+            fd = size > 8 and not (error or remote)
             put(
                 can.Message(
                     timestamp=t_us * 1e-6,
                     arbitration_id=can_id & ID_MASK,
-                    is_extended_id=bool(can_id & EXTENDED),
-                    is_remote_frame=bool(can_id & REMOTE),
-                    data=raw[at * 64 : at * 64 + size],
+                    is_extended_id=bool(can_id & EXTENDED) and not error,
+                    is_remote_frame=remote and not error,
+                    is_error_frame=error,
+                    data=None if remote and not error else raw[at * 64 : at * 64 + size],
                     dlc=size,
-                    is_fd=size > 8,
-                    bitrate_switch=size > 8,
+                    is_fd=fd,
+                    bitrate_switch=fd,
                     is_rx=bool(received),
                 )
             )
@@ -159,7 +232,7 @@ def _group_rows(group: str, frames: Records) -> Records:
     rows, fd = np.zeros(len(frames), _group_dtype(group)), frames["size"] > 8
     values = {
         "ID": frames["can_id"] & ID_MASK,
-        "IDE": (frames["can_id"] & EXTENDED) != 0,
+        "IDE": (frames["can_id"] & (EXTENDED | ERROR)) == EXTENDED,
         "DLC": _DLC[frames["size"]],
         "DataLength": frames["size"],
         "DataBytes": frames["data"],

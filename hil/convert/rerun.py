@@ -15,7 +15,7 @@ from drivers.mapping import MEASURED
 from drivers.watch import CommandWatch
 from hil.app import Setup
 from hil.convert.periods import MOST_NS, Grid, Heard, Period, Roles, around
-from hil.convert.recordings import ID_MASK
+from hil.convert.readers.recorded import ID_MASK
 from hil.loop import COUNTER_JUMP, ENDED, missed
 from hil.shadow import ShadowDrive
 from hil.signals import Request, RxFlag, new_ticks

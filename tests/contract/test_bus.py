@@ -383,3 +383,28 @@ ip route add default via 10.9.8.2 dev veth0"""
     assert int(lo) >= 20, "the sniffer must see what is there"
     assert int(strange0) >= 1 and int(strange1) >= 1, "the stranger's datagram did go out on the wire"
     assert intruded == "False"
+
+
+@pytest.mark.parametrize("flag", [ERR_FLAG, RTR_FLAG, ERR_FLAG | EFF_FLAG, RTR_FLAG | EFF_FLAG])
+@pytest.mark.parametrize("interface", ["hil-local", "virtual"])
+def test_no_link_sends_what_is_no_data_frame(channel: str, interface: str, flag: int) -> None:
+    """Error class 0x80 without its flag would be SYNC."""
+    link = open_link(BusSettings(interface, channel))
+    with can.Bus(interface=interface, channel=channel) as other:
+        with pytest.raises(LinkError, match="only data frames are sent"):
+            link.send(flag | 0x80, bytes(8))
+        link.send(0x80, b"\x01")
+        heard = other.recv(2.0)
+        assert heard is not None and bytes(heard.data) == b"\x01", "the first that went out"
+    link.close()
+
+
+def test_remote_and_error_frames_through_any_adapter(channel: str) -> None:
+    """A remote frame has the length that it asks for, an error frame its class and nothing else."""
+    link = open_link(BusSettings("virtual", channel))
+    with can.Bus(interface="virtual", channel=channel) as other:
+        other.send(can.Message(arbitration_id=0x181, is_extended_id=False, is_remote_frame=True, dlc=5))
+        other.send(can.Message(arbitration_id=4, is_error_frame=True, data=bytes(8)))
+        assert link.receive(WAIT_NS) == Frame(0x181, bytes(5), RTR_FLAG, False)
+        assert link.receive(WAIT_NS) == Frame(4, bytes(8), ERR_FLAG, False)
+    link.close()

@@ -322,3 +322,77 @@ def test_keys_pause_step_and_go_on() -> None:
 def test_starting_paused_needs_a_terminal(path: Path, channel: str, capsys: Any) -> None:
     assert main(["play", str(path), "-i", "hil-local", "-c", channel, "--paused"]) == 2
     assert "needs a terminal" in capsys.readouterr().err
+
+
+def with_others() -> Records:
+    """The drive's frames, and an error frame of SYNC's class, one of COMMAND's, and a remote frame."""
+    frames = FRAMES.copy()
+    frames["can_id"][10], frames["can_id"][20] = 0x20000080, 0x20000201
+    frames["can_id"][31], frames["received"][31] = 0x40000181, 1
+    return frames
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".log", ".asc", ".blf", ".mf4"])
+def test_error_and_remote_frames_are_never_played(tmp_path: Path, ending: str) -> None:
+    frames = with_others()
+    write_log(tmp_path / "run.mcap", some_ticks(100), frames)
+    path = tmp_path / f"run{ending}"
+    if ending != ".mcap":
+        export(tmp_path / "run.mcap", path, frames=True)
+    source = Source(path)
+    found = [(frame.can_id, frame.data) for frame in source.frames()]
+    data = frames[(frames["can_id"] & 0x60000000) == 0]
+    assert found == [(int(f["can_id"]), bytes(f["data"][: f["size"]])) for f in data]
+    assert source.left_out == {"error frames left out": 2, "remote frames left out": 1}
+
+
+def test_what_was_left_out_is_said(tmp_path: Path, channel: str, capsys: Any) -> None:
+    write_log(tmp_path / "run.mcap", some_ticks(100), with_others())
+    words = ["play", str(tmp_path / "run.mcap"), "-i", "virtual", "-c", channel, "--rate", "100"]
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        assert main([*words, "--direction", "both", "--json"]) == 0
+        heard = []
+        while (message := bus.recv(0.0)) is not None:
+            heard.append(message)
+    found = json.loads(capsys.readouterr().out)
+    assert found["error frames left out"] == 2 and found["frames sent"] == len(heard) == 297
+    assert not any(m.is_error_frame or m.is_remote_frame for m in heard)
+
+
+STAMP = "(1795758784.904425)"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.log", f"{STAMP} can0 181#11\n{STAMP} can1 181#22\n", "name one with --recorded-channel"),
+        ("a.log", f"{STAMP} can0 181#11\n{STAMP} can0 181#1\n", "1 of 2 lines can't be read"),
+        ("a.log", "  can0  181   [1]  11\n", "what candump prints on the screen"),
+        ("a.blf", "", "empty"),
+        ("a.txt", "x", "a recording ends in one of"),
+    ],
+)
+def test_a_recording_that_is_not_clear_is_refused_before_anything_is_sent(
+    tmp_path: Path, channel: str, capsys: Any, name: str, text: str, said: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    words = ["play", str(tmp_path / name), "-i", "virtual", "-c", channel, "--direction", "both"]
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        assert main(words) == 2
+        assert bus.recv(0.0) is None
+    err = capsys.readouterr().err
+    assert said in err and len(err.strip().splitlines()) == 1
+
+
+def test_one_channel_of_several_is_played_and_what_is_there_of_a_damaged_one(
+    tmp_path: Path, channel: str, capsys: Any
+) -> None:
+    (tmp_path / "a.log").write_text(
+        f"{STAMP} can0 181#11\n{STAMP} can1 181#22\n{STAMP} can1 xx\n{STAMP} can1 181#33\n"
+    )
+    words = ["play", str(tmp_path / "a.log"), "-i", "virtual", "-c", channel, "--recorded-channel", "can1"]
+    with can.Bus(interface="virtual", channel=channel) as bus:
+        assert main([*words, "--partial", "--json"]) == 0
+        heard = [bytes(message.data) for message in (bus.recv(0.0), bus.recv(0.0)) if message]
+    found = json.loads(capsys.readouterr().out)
+    assert heard == [b"\x22", b"\x33"] and "1 of 4 lines" in found["log"]
