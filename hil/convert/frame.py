@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from hil.log.reader import Log
 
 ENUMS: Final = {"drive_state": DriveState, "state": DriveState, "reason": Reason, "request": Request}
+NAME_BYTES: Final = 32
 REMEDY: Final = "pip install 'hil-drive[export]'"
 
 
@@ -48,6 +49,12 @@ def data_frame(log: Log, *, names: bool) -> Any:
     frame.attrs["units"] = {field.name: field.unit for field in FIELDS}
     frame.attrs["meanings"] = {field.name: field.doc for field in FIELDS}
     return frame
+
+
+def named(name: str, values: Any) -> Any:
+    """The names of an enum field's values as text of a fixed size; a number that has none is its digits."""
+    kinds, places = np.unique(values, return_inverse=True)
+    return np.array([_name(ENUMS[name], int(value)) for value in kinds], f"S{NAME_BYTES}")[places]
 
 
 def _name(kind: Any, value: int) -> str:

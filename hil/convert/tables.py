@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tempfile
+from datetime import datetime
 from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 
-from hil.convert.frame import need, title
+from hil.convert.frame import ENUMS, named, need, title
+from hil.convert.recordings import start_s
 from hil.log.errors import LogError
 from hil.log.reader import Log
 from hil.signals import FIELDS, TickArray
@@ -68,16 +70,22 @@ class CsvTable:
 
 
 class Mf4Table:
-    """MF4 through asammdf: one group whose signals have units; time since the first tick [s] as master."""
+    """MF4 through asammdf: one group whose signals have units; time since the first tick [s] as master.
+
+    The file starts when the run did. Numbers that have names stay numbers, and the names are text beside them
+    (``state_name``): of a value table readers give text alone, and nothing for a number without a name.
+    """
 
     def __init__(self, path: Path, log: Log) -> None:
         self._asammdf = need("asammdf", "MF4")
         self._path, self._file = path, self._asammdf.MDF(version="4.10")
+        self._file.header.start_time = datetime.fromtimestamp(start_s(log)).astimezone()
         self._first: int | None = None
 
     def add(self, ticks: TickArray) -> None:
         """Append ticks; asammdf keeps them in a temporary file."""
         columns, t = _columns(ticks), np.ascontiguousarray(ticks["t_ns"])
+        names = {name: named(name, ticks[name]) for name in ENUMS}
         if self._first is None:
             self._first = int(t[0])
             seconds = (t - self._first) * 1e-9
@@ -85,9 +93,14 @@ class Mf4Table:
                 self._asammdf.Signal(samples, seconds, unit=field.unit, name=field.name, comment=field.doc)
                 for field, samples in zip(FIELDS, columns, strict=True)
             ]
+            signals += [
+                self._asammdf.Signal(texts, seconds, name=f"{name}_name", encoding="utf-8")
+                for name, texts in names.items()
+            ]
             self._file.append(signals, acq_name="hil ticks", common_timebase=True)
         else:
-            self._file.extend(0, [((t - self._first) * 1e-9, None), *((column, None) for column in columns)])
+            every = ((t - self._first) * 1e-9, *columns, *names.values())
+            self._file.extend(0, [(column, None) for column in every])
 
     def close(self, *, whole: bool) -> None:
         """Write the file, when it is whole; let go of the temporary one."""

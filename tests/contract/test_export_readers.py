@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from hil.cli import main
 from hil.convert import export as module
 from hil.convert.export import export
 from hil.convert.frame import MissingPackage, need
+from hil.convert.recording import Recording
 from hil.log.errors import LogError
+from hil.log.mcapfile import RunFile
 from hil.log.schema import Records
 from hil.signals import FIELDS, DriveState
-from tests.logfiles import some_frames, some_ticks, write_log
+from tests.logfiles import HEADER, some_frames, some_ticks, write_log
 
 NAMES = [field.name for field in FIELDS]
 
@@ -114,6 +117,7 @@ def test_mat_refuses_more_ticks_than_a_variable_holds(
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 
 
+@pytest.mark.filterwarnings("ignore:The inplace keyword")  # asammdf's use of pandas
 def test_mf4(path: Path, tmp_path: Path) -> None:
     from asammdf import MDF
 
@@ -123,6 +127,34 @@ def test_mf4(path: Path, tmp_path: Path) -> None:
             signal = file.get(field.name)
             assert same_bits(signal.samples, field.name) and signal.unit == field.unit
         assert np.array_equal(file.get("w").timestamps, (TICKS["t_ns"] - TICKS["t_ns"][0]) * 1e-9)
+        wanted = {DriveState.OPERATION_ENABLED.name.encode()}
+        assert set(file.get("state_name").samples) == wanted, "a name beside its number"
+        frame = file.to_dataframe()
+    assert frame["state"].tolist() == [4] * len(TICKS) and set(frame["state_name"]) == wanted
+
+
+def test_mf4_of_ticks_and_of_frames_start_when_the_run_did(tmp_path: Path) -> None:
+    """To the microsecond, with milliseconds below 100 and whatever the zone of this machine."""
+    from asammdf import MDF
+
+    run = {**HEADER, "metadata": {**HEADER["metadata"], "started": "2026-03-01T23:59:58.045678+05:30"}}
+    with RunFile(tmp_path / "run.mcap", run) as file:
+        file.add_ticks(TICKS)
+        file.add_frames(FRAMES)
+        file.finish({"ended": "stop_requested", "ticks": len(TICKS)})
+    started = datetime(2026, 3, 1, 18, 29, 58, 45678, tzinfo=UTC)
+    for name, frames in (("t.mf4", False), ("f.mf4", True)):
+        export(tmp_path / "run.mcap", tmp_path / name, frames=frames)
+        with MDF(tmp_path / name) as found:
+            assert found.header.start_time == started
+    export(tmp_path / "run.mcap", tmp_path / "a.asc")
+    local = started.astimezone()
+    head = (tmp_path / "a.asc").read_text().splitlines()
+    assert head[0].endswith(f"{local:%H:%M:%S}.045 2026") and head[0].split()[2] == "Mar"
+    with can.ASCReader(tmp_path / "a.asc", relative_timestamp=False) as reader:
+        assert abs(next(iter(reader)).timestamp - started.timestamp()) < 1.1e-3
+    for name in ("f.mf4", "a.asc"):
+        assert Recording(tmp_path / name).start_ns == 1_772_389_798_045_678_000
 
 
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from hil.cli import main
 from hil.convert.export import export
 from hil.convert.importing import OURS, THEIRS, import_recording
 from hil.convert.periods import Grid, Heard, Period, Roles, periods, with_ahead
+from hil.convert.recording import Recording
 from hil.demo import emulator_process
 from hil.log.errors import LogError
 from hil.log.reader import open_log
@@ -159,11 +162,43 @@ def test_another_controllers_commands_are_open_loop(steady: Ran, tmp_path: Path,
 
 
 Edit = Callable[[list[str]], list[str]]
+
+
+def restamped(rows: list[str], new: Callable[[int, int], int]) -> list[str]:
+    """Lines of candump with other stamps: ``new`` of the line's number and its stamp [us]."""
+    pairs = (row[1:].split(")", 1) for row in rows)
+    stamps = ((new(at, int(stamp.replace(".", ""))), rest) for at, (stamp, rest) in enumerate(pairs))
+    return [f"({us // 1_000_000}.{us % 1_000_000:06d}){rest}" for us, rest in stamps]
+
+
+def later(rows: list[str], seconds: int, since: float = 0.5) -> list[str]:
+    """The rows, from a share of them on so much later."""
+    return restamped(rows, lambda at, us: us + (seconds * 1_000_000 if at >= since * len(rows) else 0))
+
+
+def with_line(rows: list[str], body: str, at: int = 300) -> list[str]:
+    return [*rows[:at], f"{rows[at].split()[0]} can0 {body}\n", *rows[at:]]
+
+
 BAD: dict[str, tuple[Edit, str]] = {
     "no feedback": (lambda rows: [row for row in rows if " 181#" not in row], "no valid feedback.*181"),
     "other identifiers": (lambda rows: [row.replace(" 080#", " 090#") for row in rows], "SYNC 80; seen:.*90"),
     "time goes back": (lambda rows: rows[300:] + rows[:300], "time goes back by 1.0"),
     "two channels": (lambda rows: [*rows[:50], *(r.replace("can0", "can1") for r in rows[50:])], "--channel"),
+    "an hour later": (lambda rows: later(rows, 3600), "time jumps by 3600.*cut it there"),
+    "50 days later": (lambda rows: later(rows, 50 * 86400), "time jumps by 4320000"),
+    "a week, then back": (
+        lambda rows: later(later(rows, 604800, 0.3), -604800, 0.6),
+        "time goes back by 604",
+    ),
+    "stamps of 10 ms": (lambda rows: restamped(rows, lambda _, us: us // 10_000 * 10_000), "steps of 10 ms"),
+    "stamps of 1 s": (lambda rows: restamped(rows, lambda _, us: us // 10**6 * 10**6), "steps of 1000 ms"),
+    "stamp nan": (lambda rows: ["(nan) can0 181#00\n", *rows], r"1 of \d+ lines can't be read \(line 1: "),
+    "9 bytes": (lambda rows: with_line(rows, "181#112233445566778899"), "no frame holds 9 bytes"),
+    "identifiers of another kind": (
+        lambda rows: [row.replace(" 181#", " 00000181#") for row in rows],
+        r"feedback 181, .*181x \(29 bits\)",
+    ),
     "empty": (lambda rows: [], "has no frames"),
     "noise": (lambda rows: ["\x00\xff no frame\n"], r"not a candump -l log: it begins '\\x00"),
 }
@@ -178,6 +213,65 @@ def test_what_is_refused_names_the_trouble_and_leaves_nothing(steady: Ran, tmp_p
     with pytest.raises(LogError, match=words):
         import_recording(tmp_path / "b.log", tmp_path / "back.mcap", steady.config, steady.settings)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.log", "b.log"]
+
+
+GOOD: dict[str, Edit] = {
+    "a bus error": lambda rows: with_line(rows, "20000088#0000080000000000 R"),
+    "a controller error, no direction": lambda rows: with_line(rows, "20000004#0030000000008888"),
+    "an error of SYNC's class": lambda rows: with_line(rows, "20000080#0000080000000000 R"),
+    "an error of COMMAND's class": lambda rows: with_line(rows, "20000201#0000080000000000 R"),
+    "a raw DLC": lambda rows: with_line(rows, "7A0#1122334455667788_C R"),
+    "a remote frame of SYNC's identifier": lambda rows: with_line(rows, "080#R R"),
+    "12 bytes without the flag": lambda rows: with_line(rows, "7A0#112233445566778899AABBCC R"),
+    "a frame an hour after the run": lambda rows: later([*rows, rows[-1]], 3600, 1 - 1 / (2 * len(rows))),
+}
+
+
+@pytest.mark.parametrize("case", list(GOOD))
+def test_what_is_none_of_the_runs_frames_changes_no_command(steady: Ran, tmp_path: Path, case: str) -> None:
+    """And comes back from our own exports as what it was."""
+    export(steady.log, tmp_path / "a.log")
+    rows = GOOD[case]((tmp_path / "a.log").read_text().splitlines(keepends=True))
+    (tmp_path / "b.log").write_text("".join(rows))
+    found = import_recording(tmp_path / "b.log", tmp_path / "b.mcap", steady.config, steady.settings)
+    assert found.commands == OURS and found.ended == "stop_requested" and found.frames == len(rows)
+    wanted = list(Recording(tmp_path / "b.log").frames())
+    for ending in (".log", ".asc", ".blf", ".mf4"):
+        export(tmp_path / "b.mcap", tmp_path / f"c{ending}", frames=True)
+        again = Recording(tmp_path / f"c{ending}").frames()
+        assert [one[2:] for one in again] == [one[2:] for one in wanted], ending
+
+
+def relative(lines: list[str]) -> list[str]:
+    """ASC with each time as the distance from the line before it."""
+    out, before = [], Decimal(0)
+    for line in lines:
+        stamp, _, rest = line.strip().partition(" ")
+        if re.fullmatch(r"\d+\.\d+", stamp):
+            out.append(f" {Decimal(stamp) - before} {rest}")
+            before = Decimal(stamp)
+        else:
+            out.append(line.replace("timestamps absolute", "timestamps relative"))
+    return out
+
+
+def requested(lines: list[str]) -> list[str]:
+    """ASC of a recorder that writes what is asked to be sent as well as what was."""
+    return [new for line in lines for new in ([line.replace(" Tx  ", " TxRq")] * (" Tx  " in line) + [line])]
+
+
+@pytest.mark.parametrize("edit", [relative, requested], ids=["relative times", "TxRq"])
+def test_dialects_of_asc_are_the_same_run(steady: Ran, tmp_path: Path, edit: Edit) -> None:
+    export(steady.log, tmp_path / "a.asc")
+    lines = edit((tmp_path / "a.asc").read_text().splitlines())
+    (tmp_path / "b.asc").write_text("\n".join(lines) + "\n")
+    found = import_recording(tmp_path / "b.asc", tmp_path / "b.mcap", steady.config, steady.settings)
+    assert (
+        found.commands == OURS and found.ended == "stop_requested" and len(found.notes) == (edit is requested)
+    )
+    assert differing(steady.log, tmp_path / "b.mcap") == set()
+    started = [open_log(path).metadata["run"]["started"][:22] for path in (steady.log, tmp_path / "b.mcap")]
+    assert started[0] == started[1], "to the millisecond and below"
 
 
 @pytest.mark.parametrize("ending", [".log", ".blf"])

@@ -46,8 +46,11 @@ def of_message(message: Any) -> Recorded:
 
 
 def stamp_ns(seconds: float) -> int:
-    """A stamp [s] in ns, to the microsecond, which is what a float of today's date resolves."""
-    if not math.isfinite(seconds) or not 0 <= seconds < 4e9:
+    """A stamp [s] in ns, to the microsecond, which is what a float of today's date resolves.
+
+    Raises UnreadableError. One before a file's own start is negative.
+    """
+    if not math.isfinite(seconds) or not -4e9 < seconds < 4e9:
         raise UnreadableError(f"the stamp {seconds:g} s is no time")
     return round(seconds * 1e6) * 1000
 
