@@ -179,6 +179,56 @@ def test_each_implausible_value_is_seen(
     assert {name: v for name, v in found.items() if v != "pass"} == {row: verdict}
 
 
+def test_what_a_drive_does_not_send_is_not_zero(configs: Path, settings: Settings) -> None:
+    path = configs / "inverter.toml"
+    heat = 'temperature_inverter = "Supply.InverterTemperature"\n'
+    text = path.read_text().replace('temperature_motor = "Supply.MotorTemperature"\n', "").replace(heat, "")
+    path.write_text(text.replace("temperature_max_c = 110.0\n", ""))
+    setup = load_setup(path, Overrides(settings=settings()))
+    state = Heard(
+        1001, first_ns=1, last_ns=1_000_000_001, values={"Mode": 0.0, "Rpm": 0.0, "Iq": 0.0, "Id": 0.0}
+    )
+    supply = Heard(101, first_ns=1, last_ns=1_000_000_001, values={"Udc": 560.0})
+    (row,) = (
+        r for r in traffic_rows(setup, Traffic({"MotorState": state, "Supply": supply})) if "heat" in r.check
+    )
+    assert row.verdict == "warn" and "no temperature" in row.found and " 0 degC" not in row.found
+
+
+@pytest.mark.parametrize(("beat", "verdict"), [(5, "warn"), (127, "warn")])
+def test_a_node_that_is_operational_may_be_a_drive_in_fault(
+    configs: Path, settings: Settings, beat: int, verdict: str
+) -> None:
+    setup = setup_of(configs, settings)
+    beats = {"HEARTBEAT": Heard(10, values={"NmtState": float(beat)})}
+    (row,) = (r for r in traffic_rows(setup, Traffic(dict(beats))) if r.check == "drive state")
+    assert row.verdict == verdict and ("in FAULT, too" in row.found) == (beat == 5)
+    told = beats | {"EMCY": Heard(1, data=bytes.fromhex("3081010000000000"))}
+    (row,) = (r for r in traffic_rows(setup, Traffic(told)) if r.check == "drive state")
+    assert row.verdict == "fail" and "0x8130 by its emergency message" in row.found
+    gone = beats | {"EMCY": Heard(1, data=bytes(8))}
+    assert verdicts(traffic_rows(setup, Traffic(gone)))["drive state"] == "warn"
+
+
+def test_a_length_that_is_not_the_dbcs_is_named(configs: Path, settings: Settings) -> None:
+    setup = setup_of(configs, settings, 'loop.pacing="feedback"')
+    traffic = cyclic()
+    traffic.messages["FEEDBACK"].odd_length = 12
+    (row,) = (r for r in traffic_rows(setup, traffic) if r.check == "length FEEDBACK")
+    assert row.verdict == "fail" and row.found == "FEEDBACK: length 12, DBC 8"
+
+
+def test_what_goes_out_unmapped_is_shown(configs: Path, settings: Settings) -> None:
+    path = configs / "drives/inverter_fd.dbc"
+    alive = ' SG_ Alive : 71|4@0+ (1,0) [0|15] "" Inverter\n'
+    text = path.read_text().replace(alive, alive + ' SG_ Limit : 79|8@0+ (0.5,-10) [-10|100] "A" Inverter\n')
+    text += 'BA_DEF_ SG_ "GenSigStartValue" INT 0 255;\nBA_ "GenSigStartValue" SG_ 2566852864 Limit 220;\n'
+    path.write_text(text)
+    setup = load_setup(configs / "inverter.toml", Overrides(settings=settings()))
+    (row,) = (r for r in traffic_rows(setup, Traffic()) if r.check == "start values")
+    assert row.found == "Demand.Limit = 100 A (GenSigStartValue)"
+
+
 def test_rate_damage_and_another_controller_are_seen(configs: Path, settings: Settings) -> None:
     setup = setup_of(configs, settings, 'loop.pacing="feedback"')
     slow, damaged, other, down = cyclic(), cyclic(), cyclic(), cyclic()

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from mcap.records import Chunk
 from mcap.writer import Writer
 
@@ -379,6 +380,17 @@ def test_info_of_a_cut_off_log_counts_what_is_there(tmp_path: Path, whole: bytes
     found = info(saved(tmp_path, whole[: chunk_places(whole)[6][0]]))
     assert found.counts["/tick"] == 150 and found.end_ns == 149_000_000
     assert found.damage is not None
+
+
+def test_info_counts_itself_what_the_summary_does_not(tmp_path: Path, whole: bytes) -> None:
+    """A writer may leave the statistics out; what is not counted is not 0."""
+    footer = len(whole) - len(container.MAGIC) - 20
+    raw, at = bytearray(whole), struct.unpack_from("<Q", whole, footer)[0]
+    raw[footer + 8 : footer + 16] = bytes(8)  # no offsets: the summary is read record by record
+    while raw[at] != Opcode.STATISTICS:
+        at += 9 + struct.unpack_from("<Q", raw, at + 1)[0]
+    raw[at] = 0x7E
+    assert info(saved(tmp_path, bytes(raw))).counts["/tick"] == 500
 
 
 def test_info_survives_any_flipped_byte_in_the_summary(tmp_path: Path, whole: bytes) -> None:

@@ -38,6 +38,21 @@ def test_a_limit_beyond_the_frame_is_refused(
     assert lines == [f"limits.{limit}: {part} shows no more than {top}; {value} would never trip, take less"]
 
 
+@pytest.mark.parametrize(
+    ("name", "limit", "value", "top"),
+    [
+        ("demo", "u_max_v", 328.0, "327.67"),
+        ("inverter", "u_max_v", 401.0, "400"),
+        ("paper", "T_L_max_n_m", 3000.0, "2147"),
+    ],
+)
+def test_a_limit_that_no_command_carries_is_refused(
+    configs: Path, name: str, limit: str, value: float, top: str
+) -> None:
+    lines = refused(configs / f"{name}.toml", f"limits.{limit}={value}")
+    assert lines == [f"limits.{limit}: a command carries no more than {top}; take less, or correct the DBC"]
+
+
 def test_just_below_the_frames_end_is_taken(configs: Path) -> None:
     load_setup(configs / "demo.toml", Overrides(settings=("limits.i_trip_a=20.46",)))
 
