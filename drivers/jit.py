@@ -33,7 +33,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def jit(function: Function) -> Function:
     """Compile with numba at the first call: exact IEEE arithmetic, generic processor, cached on disk."""
-    return cast(Function, _cached(numba.njit(fastmath=False, error_model="numpy")(function)))
+    return cast(Function, _cached(numba.njit(fastmath=False, error_model="numpy", forceinline=True)(function)))
 
 
 def waiting(function: Function) -> Function:

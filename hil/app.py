@@ -165,8 +165,12 @@ def slow_messages(binding: Binding) -> tuple[SlowMessage, ...]:
 
 def load_setup(path: Path, overrides: Overrides) -> Setup:
     """Load and check everything of a run without opening or sending anything."""
-    config = load_toml(path, RunConfig, overrides.as_settings())
-    database = Database(path.parent / config.drive.dbc, config.drive.node_id, config.drive.node_rule)
+    return setup_of(path, load_toml(path, RunConfig, overrides.as_settings()))
+
+
+def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Database) -> Setup:
+    """:func:`load_setup` for a configuration that is loaded; ``read`` makes a file's database."""
+    database = read(path.parent / config.drive.dbc, config.drive.node_id, config.drive.node_rule)
     load = config.controller.kind == "fac"
     parts = drive_map(config, database, str(path))
     period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked

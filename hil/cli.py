@@ -10,7 +10,21 @@ import threading
 from collections.abc import Iterator
 from typing import NoReturn
 
-from hil.commands import bench, convert, demo, emulated, faults, log, paper, play, replay, report, run, watch
+from hil.commands import (
+    bench,
+    campaign,
+    convert,
+    demo,
+    emulated,
+    faults,
+    log,
+    paper,
+    play,
+    replay,
+    report,
+    run,
+    watch,
+)
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
@@ -30,9 +44,10 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil play LOG -c vcan0        recorded frames back on a bus with their timing
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil faults [CONFIG]          every fault against the running loop, with a verdict on each
+  hil campaign PLAN            thousands of cases over all cores: yield, what matters, worst
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench, faults)
+MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench, faults, campaign)
 
 
 def _parser() -> argparse.ArgumentParser:

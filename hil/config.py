@@ -433,8 +433,8 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
     Raises :class:`hil.errors.ConfigError` that names every mistake, with a suggestion for unknown keys.
     """
     data = read_toml(path)
-    for override in overrides:
-        _apply_override(data, override, path.parent)
+    for text in overrides:
+        override(data, text, path.parent)
     return validate(data, model, str(path), path.parent)
 
 
@@ -447,26 +447,51 @@ def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path
         raise ConfigError(where, problems) from None
 
 
-def _apply_override(data: dict[str, Any], override: str, base: Path) -> None:
+def override(data: dict[str, Any], setting: str, base: Path) -> None:
     """Set one ``table.key=value``; a value that is not TOML is taken as a string.
 
     A table that is given as the path of a file is read first, so that one key of it can be changed.
     """
-    key, equals, text = override.partition("=")
+    key, equals, text = setting.partition("=")
     if not equals or not key.strip():
-        raise ConfigError("--set", [f"{override!r} is not of the form table.key=value"])
+        raise ConfigError("--set", [f"{setting!r} is not of the form table.key=value"])
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
-    *tables, last = key.strip().split(".")
+    put(data, key.strip(), value, base)
+
+
+def put(data: dict[str, Any], key: str, value: Any, base: Path, where: str = "--set") -> None:
+    """Set the key ``table.key``, of an array of tables ``table.0.key``, to ``value``. Raises ConfigError.
+
+    A table that is given as the path of a file, relative to ``base``, is read first.
+    """
+    *tables, last = key.split(".")
+    place: Any = data
     for name in tables:
-        if isinstance(data.get(name), str) and data[name].endswith(".toml"):
-            data[name] = read_toml(base / data[name])
-        data = data.setdefault(name, {})
-        if not isinstance(data, dict):
-            raise ConfigError("--set", [f"{override!r}: {name} is not a table"])
-    data[last] = value
+        place = _table_of(place, name, base)
+        if not isinstance(place, dict | list):
+            raise ConfigError(where, [f"{key}: {name} is not a table"])
+    if isinstance(place, dict):
+        place[last] = value
+        return
+    place[_row(place, last, key, where)] = value
+
+
+def _table_of(place: Any, name: str, base: Path) -> Any:
+    """What ``name`` leads to, a new table where there is none; None where it leads nowhere."""
+    if isinstance(place, list):
+        return place[int(name)] if name.isdecimal() and int(name) < len(place) else None
+    if isinstance(place.get(name), str) and place[name].endswith(".toml"):
+        place[name] = read_toml(base / place[name])
+    return place.setdefault(name, {})
+
+
+def _row(rows: list[Any], name: str, key: str, where: str) -> int:
+    if not name.isdecimal() or int(name) >= len(rows):
+        raise ConfigError(where, [f"{key}: there are entries 0 to {len(rows) - 1}, and no {name}"])
+    return int(name)
 
 
 def _describe(problem: Any, model: type[BaseModel]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.codec import Database
-from firmware_model.config import build_params, new_sample, new_state
+from firmware_model.config import PlantConfig, Wire, build_params, new_sample, new_state
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
 from firmware_model.node import wire_of
 from hil.app import Setup, header_of, log_path, needed_bytes, plan_of
@@ -154,14 +154,19 @@ def _over(tick: Any) -> bool:
 
 def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
     """Load the plant of a setup. Raises ConfigError, also when the run has no length."""
+    plant, folder = load_plant(setup.path, setup.config, plant_settings)
+    database = Database(folder / plant.dbc, plant.node_id)
+    return simulation_of(setup, plant, wire_of(database, plant.protocol))
+
+
+def simulation_of(setup: Setup, plant: PlantConfig, wire: Wire) -> Simulation:
+    """The simulation of a setup with a plant that is loaded. Raises ConfigError."""
     ticks = plan_of(setup.config).ticks
     if ticks is None:
         raise ConfigError(str(setup.path), ["loop.duration_s: missing; a simulation must end"])
-    plant, folder = load_plant(setup.path, setup.config, plant_settings)
     if plant.fault:
         raise ConfigError(str(setup.path), ["fault: a fault script needs the bus; use hil run or hil faults"])
-    database = Database(folder / plant.dbc, plant.node_id)
-    params = build_params(plant, wire_of(database, plant.protocol))
+    params = build_params(plant, wire)
     state = new_state(params, setup.wire.counter_modulus - 1)
     return Simulation(setup, params, state, ticks, setup.machine.fresh())
 

@@ -1,41 +1,26 @@
-"""`hil simulate --sweep`: the same run over every combination of some settings, side by side on all cores."""
+"""`hil simulate --sweep`: a campaign of a grid, small enough for a table and without a folder."""
 
 from __future__ import annotations
 
-import itertools
-import os
+import math
 import tomllib
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-import numpy as np
-
-from hil.app import Overrides, Setup, load_setup
-from hil.demo import true_motor
-from hil.design import motor_model
-from hil.emulate import load_plant
+from hil.app import Overrides
+from hil.campaign.case import CaseJob, Stand, job_of
+from hil.campaign.engine import batches, run
+from hil.campaign.plan import PLANT, PlanTable
+from hil.campaign.run import batch_size, ticks_of, where
+from hil.campaign.values import toml
 from hil.errors import ConfigError
-from hil.metrics import load_step, tracking_rms
-from hil.reasons import explain
-from hil.signals import Reason, TickArray
-from hil.simulate import simulate_ticks
 
-MOST_CASES = 10_000
+MOST_CASES: Final = 10_000
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One combination: ``config`` and ``plant`` are settings as ``--set`` and ``--plant-set`` take them."""
-
-    config: tuple[str, ...]
-    plant: tuple[str, ...]
-
-
-def axis(flag: str, text: str) -> list[str]:
-    """``KEY=[v1, v2, ...]`` (a TOML array) as one setting a value. Raises ConfigError."""
+def axis(flag: str, text: str) -> tuple[str, list[Any]]:
+    """``KEY=[v1, v2, ...]`` (a TOML array) as key and values. Raises ConfigError."""
     key, equals, values = text.partition("=")
     try:
         found = tomllib.loads(f"values = {values}")["values"] if equals and key.strip() else None
@@ -43,70 +28,60 @@ def axis(flag: str, text: str) -> list[str]:
         found = None
     if not isinstance(found, list) or not found:
         raise ConfigError(flag, [f"{text!r} is not of the form table.key=[value, value, ...]"])
-    return [f"{key.strip()}={_toml(value)}" for value in found]
+    return key.strip(), found
 
 
-def _toml(value: Any) -> str:
-    return (
-        f'"{value}"'
-        if isinstance(value, str)
-        else str(value).lower()
-        if isinstance(value, bool)
-        else repr(value)
-    )
-
-
-def cases(sweep: Sequence[str], plant_sweep: Sequence[str]) -> list[Case]:
-    """Every combination of the axes. Raises ConfigError, also for more than MOST_CASES."""
-    own = [axis("--sweep", text) for text in sweep]
-    plant = [axis("--plant-sweep", text) for text in plant_sweep]
-    count = int(np.prod([len(values) for values in own + plant]))
-    if count > MOST_CASES:
-        raise ConfigError("--sweep", [f"{count} combinations; at most {MOST_CASES}"])
-    return [Case(one[: len(own)], one[len(own) :]) for one in itertools.product(*own, *plant)]
-
-
-def _end(setup: Setup, ticks: TickArray) -> dict[str, Any] | None:
-    """Why a case ended; sums of the supervisor are not kept here."""
-    stopped = ticks[ticks["reason"] != 0]
-    end = explain(setup.machine.safety, None, stopped[0]) if len(stopped) else None
-    return end.as_dict() if end else None
-
-
-def run_case(path: Path, overrides: Overrides, plant_settings: list[str], case: Case) -> dict[str, Any]:
-    """Simulate one case: its settings, how it ended, and the metrics of tracking and load step."""
-    setup = load_setup(path, replace(overrides, settings=(*overrides.settings, *case.config)))
-    plant_all = [*plant_settings, *case.plant]
-    ticks = simulate_ticks(setup, plant_all)
-    plant, _ = load_plant(path, setup.config, plant_all)
-    N = int(setup.machine.law["N"][0, 0])
-    step = load_step(ticks, N, motor_model(setup.config.motor), true_motor(plant.motor))
-    return {
-        "case": [*case.config, *case.plant],
-        "ended": Reason(int(ticks["reason"][-1])).name.lower(),
-        "end": _end(setup, ticks),
-        "tracking_rms_rad_s": tracking_rms(ticks),
-        "dip_rad_s": step.dip if step else None,
-        "recovery_ms": step.recovery_ms if step else None,
-        "i_max_a": float(np.nanmax(np.hypot(ticks["i_q"], ticks["i_d"]))),
-    }
-
-
-def sweep(
+def job_of_sweep(
     path: Path,
     overrides: Overrides,
     plant_settings: list[str],
-    all_cases: list[Case],
-    seen: Callable[[int], None] | None = None,
-) -> list[dict[str, Any]]:
+    sweep: Sequence[str],
+    plant_sweep: Sequence[str],
+) -> tuple[CaseJob, Stand]:
+    """The campaign that a sweep is: a grid in which every combination is a case. Raises ConfigError."""
+    grid = [axis("--sweep", text) for text in sweep]
+    grid += [(PLANT + key, values) for key, values in (axis("--plant-sweep", text) for text in plant_sweep)]
+    count = math.prod(len(values) for _, values in grid)
+    if count > MOST_CASES:
+        raise ConfigError("--sweep", [f"{count} combinations; at most {MOST_CASES}: take hil campaign"])
+    table = PlanTable.model_validate(
+        {
+            "config": path.name,
+            "set": overrides.as_settings(),
+            "plant_set": plant_settings,
+            "grid": dict(grid),
+        }
+    )
+    return job_of(path, table)
+
+
+def sweep(job: CaseJob, stand: Stand, seen: Callable[[int], None] | None = None) -> list[dict[str, Any]]:
     """Simulate every case, in their order; ``seen`` is told how many are done. Raises HilError."""
-    rows = [
-        run_case(path, overrides, plant_settings, all_cases[0])
-    ]  # here: mistakes at once, kernels compiled
-    with ProcessPoolExecutor(os.cpu_count()) as pool:
-        futures = [pool.submit(run_case, path, overrides, plant_settings, case) for case in all_cases[1:]]
-        for future in futures:
-            rows.append(future.result())
-            if seen:
-                seen(len(rows))
-    return rows
+    rows: list[dict[str, Any]] = []
+
+    def take(more: list[dict[str, Any]]) -> None:
+        rows.extend(more)
+        if seen:
+            seen(len(rows))
+
+    count = stand.plan.count
+    used = where(stand, None, None)
+    size = batch_size(ticks_of(stand), count, used.count)
+    run(job, batches(iter([(0, count)]), size), used, take)
+    return [_row(stand, row) for row in sorted(rows, key=lambda row: int(row["case"]))]
+
+
+def _row(stand: Stand, row: dict[str, Any]) -> dict[str, Any]:
+    """A case as a sweep shows it."""
+    recovery = row.get("recovery_s")
+    settings = stand.plan.settings(row["case"])
+    return {
+        "case": [f"{key.removeprefix(PLANT)}={toml(value)}" for key, value in settings.items()],
+        "ended": row["ended"],
+        "why": row["why"],
+        "end": row.get("end"),
+        "tracking_rms_rad_s": row.get("tracking_rms_rad_s"),
+        "dip_rad_s": row.get("dip_rad_s"),
+        "recovery_ms": None if recovery is None else 1e3 * recovery,
+        "i_max_a": row.get("i_peak_a"),
+    }

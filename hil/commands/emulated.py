@@ -73,12 +73,13 @@ def cmd_simulate(args: argparse.Namespace) -> int:
 
 
 def _sweep(args: argparse.Namespace) -> int:
-    from hil.sweep import cases, sweep
+    from hil.sweep import job_of_sweep, sweep
     from hil.view import progress, show, sweep_table
 
-    every = cases(args.sweep, args.plant_sweep)
-    with progress(f"simulate {len(every)} cases", len(every)) as seen:
-        rows = sweep(args.config, overrides(args), args.plant_set, every, seen)
+    job, stand = job_of_sweep(args.config, overrides(args), args.plant_set, args.sweep, args.plant_sweep)
+    count = stand.plan.count
+    with progress(f"simulate {count} cases", count) as seen:
+        rows = sweep(job, stand, seen)
     if args.json:
         print_json({"rows": rows})
     else:

@@ -6,6 +6,7 @@ Source: the paper's eq. (1); the sampled form is exact for d constant over a tic
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -69,27 +70,31 @@ def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledMod
 def _gap_inverses(Ad: Array, Ed: Array, T_s: float, max_gap: int) -> Array:
     """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap or the last regular one; shape (count, n, n)."""
     n = Ad.shape[0]
-    inverses: list[Array] = []
+    integrals = np.zeros((max_gap, n, n))
     power, total = np.eye(n), np.zeros((n, n))
-    while len(inverses) < max_gap:
+    for m in range(max_gap):
         total = total + power @ Ed
         power = power @ Ad
-        if _is_singular(total, (len(inverses) + 1) * T_s):
-            break
-        inverses.append(np.linalg.inv(total))
-    if not inverses:
+        integrals[m] = total
+    count = _regular(integrals, T_s)
+    if not count:
         raise ControlDesignError(
             "Ed is singular or not finite: A has an eigenvalue 2 pi j k / T_s; change T_s"
         )
-    return _frozen(np.array(inverses))
+    return _frozen(np.linalg.inv(integrals[:count]))
 
 
-def _is_singular(integral: Array, length: float) -> bool:
-    """Whether int_0^length e^{A s} ds is singular, also where all of it cancels; e^{A 0} = I is the scale."""
-    if not np.isfinite(integral).all():
-        return True
-    sigma = np.linalg.svd(integral, compute_uv=False)
-    return bool(sigma[-1] * SINGULAR < max(sigma[0], length))
+def _regular(integrals: Array, T_s: float) -> int:
+    """How many of int_0^{m T_s} e^{A s} ds, m = 1, 2, ... are regular one after another.
+
+    Singular is also one where all of it cancels; e^{A 0} = I is the scale.
+    """
+    finite: Any = np.isfinite(integrals).all(axis=(1, 2))
+    count = len(integrals) if finite.all() else int(np.argmin(finite))
+    sigma = np.linalg.svd(integrals[:count], compute_uv=False)
+    lengths = T_s * np.arange(1, count + 1)
+    singular = sigma[:, -1] * SINGULAR < np.maximum(sigma[:, 0], lengths)
+    return int(np.argmax(singular)) if singular.any() else count
 
 
 def _frozen(array: Array) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from hil.config import CriteriaTable
 from hil.report.collect import Run
 from hil.signals import Reason
 
@@ -137,17 +138,26 @@ def limits(run: Run) -> dict[str, float]:
     """What the config demands: figure key to largest value; ``dip_max_rad_s`` limits ``dip_rad_s``."""
     if run.config is None or open_loop(run):
         return {}
-    given = run.config.criteria.model_dump(exclude_none=True)
-    return {key.replace("_max", "", 1): float(value) for key, value in given.items()}
+    return demanded(run.config.criteria)
+
+
+def demanded(criteria: CriteriaTable) -> dict[str, float]:
+    """Figure key to largest value, in the order of :data:`FIGURES`."""
+    given = {
+        key.replace("_max", "", 1): float(value)
+        for key, value in criteria.model_dump(exclude_none=True).items()
+    }
+    return {figure.key: given[figure.key] for figure in FIGURES if figure.key in given}
 
 
 def judge(run: Run) -> list[Check]:
     """Every check of a run, those that need no config first."""
-    demanded = limits(run)
-    return [*_always(run), *(_limit(run, f, demanded[f.key]) for f in FIGURES if f.key in demanded)]
+    most = limits(run)
+    return [*_always(run), *(check_limit(run, f, most[f.key]) for f in FIGURES if f.key in most)]
 
 
-def _limit(run: Run, figure: Figure, most: float) -> Check:
+def check_limit(run: Run, figure: Figure, most: float) -> Check:
+    """The check of one figure."""
     value = figure.of(run)
     outcome: Outcome = "no data" if value is None else "pass" if value <= most else "fail"
     return Check(figure.name, outcome, number(value, figure.unit), f"at most {number(most, figure.unit)}")

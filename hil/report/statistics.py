@@ -155,7 +155,7 @@ class Totals:
 
     def _count(self, ticks: TickArray) -> None:
         for where, column, kind in (("bus", "rx_flags", RxFlag), ("guard", "guard_flags", GuardFlag)):
-            words, counts = np.unique(ticks[column], return_counts=True)
+            words, counts = _tally(ticks[column])
             for flag in kind:
                 name = f"{where}: {flag.name.lower().replace('_', ' ')}"
                 seen = int(counts[(words & int(flag)) != 0].sum())
@@ -168,6 +168,15 @@ class Totals:
     def tracking_rms(self) -> float | None:
         """RMS of w - w* in operation [rad/s]."""
         return math.sqrt(self.squared_error / self.operating) if self.operating else None
+
+
+def _tally(words: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """The words that are there, and how often; without sorting, where a table of them is small."""
+    if words.max() >= 1 << 16:
+        return np.unique(words, return_counts=True)
+    counts = np.bincount(words)
+    found = np.nonzero(counts)[0]
+    return found, counts[found]
 
 
 def _peak(values: npt.NDArray[Any]) -> float:

@@ -11,17 +11,22 @@ from hil.app import Overrides, load_setup
 from hil.cli import main
 from hil.errors import ConfigError
 from hil.simulate import simulate
-from hil.sweep import axis, cases
+from hil.sweep import axis, job_of_sweep
 
 CONFIG = Path(__file__).parents[2] / "configs" / "demo.toml"
 
 
 def test_axes_become_every_combination() -> None:
-    found = cases(["a.x=[1, 2]"], ["b.y=[0.5, 1.5, 2.5]", 'c.z=["u", "v"]'])
-    assert len(found) == 12
-    assert found[0].config == ("a.x=1",) and found[0].plant == ("b.y=0.5", 'c.z="u"')
-    assert found[-1].config == ("a.x=2",) and found[-1].plant == ("b.y=2.5", 'c.z="v"')
-    assert axis("--sweep", "a.b=[true]") == ["a.b=true"]
+    plant = ["sensors.i_noise_a=[0.0, 0.001, 0.002]", "seed=[1, 2]"]
+    _, stand = job_of_sweep(CONFIG, Overrides(), [], ["loop.duration_s=[1, 2.0]"], plant)
+    assert stand.plan.count == 12
+    assert stand.plan.settings(0) == {
+        "loop.duration_s": 1,
+        "plant:sensors.i_noise_a": 0.0,
+        "plant:seed": 1,
+    }
+    assert list(stand.plan.settings(11).values()) == [2.0, 0.002, 2]
+    assert axis("--sweep", "a.b=[true]") == ("a.b", [True])
 
 
 @pytest.mark.parametrize("text", ["a.b=3", "a.b=[]", "a.b", "=[1]", "a.b=[1", "a.b={x=1}"])
@@ -31,9 +36,9 @@ def test_what_is_no_axis_is_refused(text: str) -> None:
 
 
 def test_too_many_cases_are_refused() -> None:
-    wide = f"a.b={list(range(200))}"
+    wide = f"={list(range(200))}"
     with pytest.raises(ConfigError, match="40000 combinations"):
-        cases([wide], [wide])
+        job_of_sweep(CONFIG, Overrides(), [], ["a.b" + wide, "a.c" + wide], [])
 
 
 def test_a_heavier_motor_dips_less(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,299 @@
+"""One case from its number to its row: the run configuration and its plant read once, the rest a case's own.
+
+A case that cannot be loaded, or that breaks, is a row with the reason. What a case gives depends on the job
+and its number alone: every cache here is of a pure function.
+"""
+
+from __future__ import annotations
+
+import pickle
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+
+import numpy as np
+
+from drivers.codec import Database
+from drivers.errors import DriverError
+from firmware_model.config import PlantConfig, Wire
+from firmware_model.node import wire_of
+from hil.app import Setup, setup_of
+from hil.campaign.figures import KEYS, Judged
+from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
+from hil.config import RunConfig, override, put, read_toml, validate
+from hil.control.errors import ControlDesignError
+from hil.errors import ConfigError, HilError
+from hil.reasons import explain
+from hil.report.criteria import demanded
+from hil.signals import Reason
+from hil.simulate import Simulation, simulation_of
+
+REFUSALS: Final = (HilError, DriverError, ControlDesignError)
+SETUPS: Final = 64
+WORDS: Final = ("case", "sample", "variant", "seed", "ended", "passed", "why")
+
+
+def first_line(error: Exception) -> str:
+    """What an error says, in a line."""
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
+
+
+class Stand:
+    """Everything that the cases of a plan share. ``path``: the run configuration in its folder."""
+
+    def __init__(self, path: Path, table: PlanTable, where: str) -> None:
+        self.path = path
+        self._config = _opened(read_toml(path), path.parent)
+        for text in table.settings:
+            override(self._config, text, path.parent)
+        self._plant_set = table.plant_set
+        self._plants = lru_cache(maxsize=16)(self._read_plant)
+        self._databases = lru_cache(maxsize=16)(Database)
+        self._wires = lru_cache(maxsize=16)(lambda dbc, node, kind: wire_of(self._databases(dbc, node), kind))
+        self._setups: dict[bytes, Setup] = {}
+        self.plan: Plan = Builder(where, self.own).build(table)
+        for key, value in self.plan.fixed.items():
+            put(self._config, key, value, path.parent)
+
+    def _read_plant(self, name: str) -> bytes:
+        path = self.path.parent / name
+        data = _opened(read_toml(path), path.parent)
+        for text in self._plant_set:
+            override(data, text, path.parent)
+        return pickle.dumps(data)
+
+    def own(self, key: str) -> Any:
+        """A key's value in the configuration or the plant; None where it has none."""
+        data, name = self._config, key
+        if key.startswith(PLANT):
+            data, name = pickle.loads(self._plants(self._plant_of(self._config))), key[len(PLANT) :]
+        place: Any = data
+        for part in name.split("."):
+            if isinstance(place, list):
+                place = place[int(part)] if part.isdecimal() and int(part) < len(place) else None
+            else:
+                place = place.get(part) if isinstance(place, dict) else None
+        return place
+
+    def _plant_of(self, data: dict[str, Any]) -> str:
+        name = data.get("emulator", {}).get("plant") if isinstance(data.get("emulator"), dict) else None
+        if not isinstance(name, str):
+            raise ConfigError(
+                str(self.path), ['emulator: missing; add [emulator] with plant = "plants/demo.toml"']
+            )
+        return name
+
+    @cached_property
+    def criteria(self) -> list[str]:
+        """Keys of the figures that are judged."""
+        return list(demanded(self._setup({}).config.criteria))
+
+    def columns(self) -> list[str]:
+        """The names of a row's columns, in order."""
+        figures = [*KEYS, *(f"criteria:{key}" for key in self.criteria)]
+        return [*WORDS[:4], *self.plan.keys, *WORDS[4:], *figures]
+
+    def _setup(self, settings: Settings) -> Setup:
+        """The designed controller of some settings of the configuration."""
+        key = pickle.dumps(settings)
+        if key not in self._setups:
+            data: dict[str, Any] = pickle.loads(pickle.dumps(self._config))
+            for name, value in settings.items():
+                put(data, name, value, self.path.parent, "config")
+            config = validate(data, RunConfig, "config", self.path.parent)
+            made = setup_of(self.path, config, self._databases)
+            if len(self._setups) >= SETUPS:
+                self._setups.clear()
+            self._setups[key] = made
+        return self._setups[key]
+
+    def _plant(self, setup: Setup, settings: Settings, seed: int | None) -> tuple[PlantConfig, Wire]:
+        name = setup.config.emulator.plant if setup.config.emulator else self._plant_of({})
+        folder = (self.path.parent / name).parent
+        data: dict[str, Any] = pickle.loads(self._plants(name))
+        if seed is not None:
+            data["seed"] = seed
+        for key, value in settings.items():
+            put(data, key, value, folder, "plant")
+        plant = validate(data, PlantConfig, "plant", folder)
+        return plant, self._wires(folder / plant.dbc, plant.node_id, plant.protocol)
+
+    def simulation(self, settings: Settings, seed: int | None = None) -> tuple[Setup, Simulation]:
+        """Controller and plant of some settings. Raises HilError, DriverError, ControlDesignError."""
+        own = {key: value for key, value in settings.items() if not key.startswith(PLANT)}
+        plant_settings = {
+            key[len(PLANT) :]: value for key, value in settings.items() if key.startswith(PLANT)
+        }
+        setup = self._setup(own)
+        plant, wire = self._plant(setup, plant_settings, seed)
+        return setup, simulation_of(setup, plant, wire)
+
+    def run(self, case: int) -> dict[str, Any]:
+        """The row of a case, whatever becomes of it."""
+        settings = self.plan.settings(case)
+        seed = self.plan.noise_seed(case)
+        row: dict[str, Any] = {
+            "case": case,
+            "sample": self.plan.split(case)[1],
+            "variant": self.plan.variant(case),
+            "seed": seed,
+        }
+        row |= settings
+        try:
+            setup, simulation = self.simulation(settings, seed)
+            return row | judged(setup, simulation)
+        except REFUSALS as error:
+            return row | {"ended": "refused", "passed": False, "why": first_line(error)}
+        except Exception as error:  # noqa: BLE001 - one case that breaks is a row, not the end of the campaign
+            why = f"{type(error).__name__}: {first_line(error)}"
+            return row | {"ended": "broke", "passed": False, "why": why}
+
+
+def judged(setup: Setup, simulation: Simulation) -> dict[str, Any]:
+    """Simulate; the figures, and why it ended where nobody asked."""
+    found = Judged(setup.config, int(setup.machine.law["N"][0, 0]))
+    stop = None
+    for ticks in simulation.blocks():
+        found.feed(ticks)
+        if stop is None and ticks["reason"][-1]:
+            stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
+    row, machine = found.finish(), simulation.machine
+    end = None if stop is None else explain(machine.safety, machine.safety_state, stop)
+    if end is None:
+        return row | {"end": None}
+    asked = found.reason == Reason.STOP_REQUESTED
+    return row | {"end": end.as_dict(), "why": row["why"] if asked else end.text}
+
+
+def _opened(data: dict[str, Any], base: Path) -> dict[str, Any]:
+    """The data with the tables that it names as files read, once instead of for every case."""
+    return {
+        name: read_toml(base / value) if isinstance(value, str) and value.endswith(".toml") else value
+        for name, value in data.items()
+    }
+
+
+@dataclass(frozen=True)
+class CaseJob:
+    """A campaign as it goes to a worker: the plan and every file that its cases read."""
+
+    config: str
+    files: tuple[tuple[str, bytes], ...]
+    table: str
+    where: str
+
+    @property
+    def unit(self) -> str:
+        """What is counted."""
+        return "cases"
+
+    def run(self, start: int, stop: int) -> list[dict[str, Any]]:
+        """The rows of the cases from ``start`` up to ``stop``."""
+        stand = stand_of(self)
+        return [stand.run(case) for case in range(start, stop)]
+
+
+@lru_cache(maxsize=2)
+def stand_of(job: CaseJob) -> Stand:
+    """The stand of a job, made once a process, from its files in a folder that goes with the process."""
+    holder = tempfile.TemporaryDirectory(prefix="hil-campaign-")
+    unpack(job.files, Path(holder.name))
+    stand = Stand(Path(holder.name) / job.config, PlanTable.model_validate_json(job.table), job.where)
+    _held.append(holder)
+    return stand
+
+
+_held: list[tempfile.TemporaryDirectory[str]] = []
+
+
+def unpack(files: tuple[tuple[str, bytes], ...], folder: Path) -> None:
+    """Write the files of a job under a folder."""
+    for name, content in files:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def job_of(plan_path: Path, table: PlanTable) -> tuple[CaseJob, Stand]:
+    """The job of a plan, and the stand of this process. Raises HilError."""
+    path = (plan_path.parent / table.config).resolve()
+    stand = Stand(path, table, str(plan_path))
+    files = files_of(stand, path)
+    root = Path(*_common([file.parts[:-1] for file in files]))
+    packed = tuple((PurePosixPath(file.relative_to(root)).as_posix(), file.read_bytes()) for file in files)
+    job = CaseJob(
+        path.relative_to(root).as_posix(), packed, table.model_dump_json(by_alias=True), str(plan_path)
+    )
+    refuse_unknown(stand, str(plan_path))
+    return job, stand
+
+
+def _common(folders: list[tuple[str, ...]]) -> list[str]:
+    """The parts of the folder that all are in."""
+    out = []
+    for parts in zip(*folders, strict=False):
+        if len(set(parts)) > 1:
+            break
+        out.append(parts[0])
+    return out
+
+
+def files_of(stand: Stand, path: Path) -> list[Path]:
+    """Every file that a case may read: configuration, plant, what they include, DBCs, files in values."""
+    found = {path: None} | dict.fromkeys(_named(read_toml(path), path.parent))
+    plant = path.parent / str(stand.own("emulator.plant"))
+    found |= {plant.resolve(): None} | dict.fromkeys(_named(read_toml(plant), plant.parent))
+    for key, values in stand.plan.listed().items():
+        base = plant.parent if key.startswith(PLANT) else path.parent
+        for file in _named(list(values), base):
+            found |= {file: None}
+            if file.suffix == ".toml":
+                found |= dict.fromkeys(_named(read_toml(file), file.parent))
+    return list(found)
+
+
+def _named(value: Any, base: Path) -> list[Path]:
+    """Files that texts anywhere in a value name, relative to a folder."""
+    if isinstance(value, str):
+        known = value.endswith((".toml", ".dbc")) and (base / value).is_file()
+        return [(base / value).resolve()] if known else []
+    if isinstance(value, Mapping):
+        return [file for item in value.values() for file in _named(item, base)]
+    if isinstance(value, list | tuple):
+        return [file for item in value for file in _named(item, base)]
+    return []
+
+
+def refuse_unknown(stand: Stand, where: str) -> None:
+    """Refuse a plan whose base, or a key of it, can't be set at all. Raises HilError."""
+    stand.simulation({}, None)
+    problems = []
+    for key, values in stand.plan.listed().items():
+        found = [_why(stand, {key: value}) for value in values]
+        unknown = [
+            why for why in found if why is not None and ("unknown key" in why or "is not a table" in why)
+        ]
+        unknown += [why for why in found if why is not None and "there are entries" in why]
+        if unknown and all(found):
+            problems.append(f"{key}: {unknown[0].partition(': ')[2]}")
+    if problems:
+        raise ConfigError(where, problems)
+    firsts = [_why(stand, stand.plan.settings(case)) for case in range(min(stand.plan.count, 16))]
+    if all(firsts):
+        raise ConfigError(where, [f"none of its first {len(firsts)} cases can be: {firsts[0]}"])
+
+
+def _why(stand: Stand, settings: Settings) -> str | None:
+    """Why settings can't be; None when they can."""
+    try:
+        stand.simulation(settings, None)
+    except REFUSALS as error:
+        return first_line(error)
+    return None
+
+
+__all__ = ["CaseJob", "Stand", "job_of", "stand_of"]

@@ -1,0 +1,129 @@
+"""``hil campaign``: a plan's cases over cores or a cluster; campaigns compared; logs under a new config."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hil.commands.common import EXIT_FAILED, Commands, print_json, say
+
+if TYPE_CHECKING:
+    from hil.campaign.engine import Rate
+
+EVERY_S = 10.0
+
+
+def register(commands: Commands) -> None:
+    """Add what this module offers."""
+    command = commands.add(
+        "campaign", cmd_campaign, "Run every case of PLAN into a folder of rows and a report."
+    )
+    command.add_argument(
+        "what",
+        nargs="*",
+        type=Path,
+        metavar="PLAN",
+        help="the plan; for --compare two folders, for --what-if logs",
+    )
+    command.add_argument(
+        "-o", "--output", type=Path, metavar="DIR", help="folder of the results (default: PLAN without .toml)"
+    )
+    command.add_argument(
+        "-j",
+        "--workers",
+        type=int,
+        metavar="N",
+        help="local processes (default: one a core; 0: none but this)",
+    )
+    command.add_argument(
+        "--scheduler", metavar="ADDRESS", help="an existing scheduler of Dask, tcp://HOST:PORT"
+    )
+    command.add_argument("--resume", action="store_true", help="go on with what the folder holds")
+    command.add_argument(
+        "--dry-run", action="store_true", help="say how many cases, how long, how large; run none"
+    )
+    command.add_argument("--case", type=int, metavar="N", help="run case N alone and print its row")
+    command.add_argument("--strict", action="store_true", help="exit code 1 unless every case passes")
+
+
+def cmd_campaign(args: argparse.Namespace) -> int:
+    """Run a campaign."""
+    from hil.errors import HilError
+
+    if len(args.what) != 1:
+        raise HilError("hil campaign takes one PLAN")
+    if args.dry_run:
+        return _dry_run(args)
+    if args.case is not None:
+        return _case(args)
+    return _run(args)
+
+
+def _dry_run(args: argparse.Namespace) -> int:
+    from hil.campaign.run import dry_run
+    from hil.view import key_values, show
+
+    found = dry_run(args.what[0], args.workers)
+    if args.json:
+        print_json(found)
+    else:
+        rows = {
+            "cases": found["cases"],
+            "time": f"about {found['seconds']:.0f} s with {found['workers'] or 'this process, no'} workers",
+            "size": f"about {found['bytes'] / 1e6:.1f} MB",
+            "varied": ", ".join(found["keys"]),
+        }
+        show(key_values(args.what[0].name, rows))
+    return 0
+
+
+def _case(args: argparse.Namespace) -> int:
+    from hil.campaign.run import one_case
+    from hil.view import key_values, show
+
+    row = one_case(args.what[0], args.case)
+    if args.json:
+        print_json(row)
+    else:
+        show(key_values(f"case {args.case}", row))
+    return EXIT_FAILED if args.strict and not row["passed"] else 0
+
+
+def _run(args: argparse.Namespace) -> int:
+    from hil.campaign.run import campaign
+    from hil.view import key_values, show
+
+    folder = args.output or args.what[0].with_suffix("")
+    options: dict[str, Any] = {"workers": args.workers, "scheduler": args.scheduler, "resume": args.resume}
+    with progress("cases") as seen:
+        result = campaign(args.what[0], folder, **options, seen=seen)
+    if args.json:
+        print_json(result.as_dict())
+    else:
+        show(key_values(f"hil campaign {args.what[0].name}", result.as_dict()))
+    return EXIT_FAILED if args.strict and result.failed else 0
+
+
+@contextlib.contextmanager
+def progress(unit: str) -> Iterator[Callable[[Rate], None]]:
+    """Rate and time left on standard error: a line that is rewritten, or one every ten seconds."""
+    terminal, last = sys.stderr.isatty(), [0.0]
+
+    def seen(rate: Rate) -> None:
+        line = rate.line(unit)
+        if terminal:
+            sys.stderr.write(f"\r\x1b[K{line}")
+        elif rate.seconds - last[0] >= EVERY_S:
+            last[0] = rate.seconds
+            say(f"hil: {line}")
+
+    try:
+        yield seen
+    finally:
+        if terminal:
+            sys.stderr.write("\r\x1b[K")
+            sys.stderr.flush()
