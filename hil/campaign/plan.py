@@ -274,7 +274,7 @@ class Builder:
 
     def _axes(self, table: str, given: Axes, read: Any, leaf: Any = None) -> dict[str, Any]:
         out = {}
-        for key, value in flat(given, leaf or (lambda _: False)).items():
+        for key, value in flat(given, leaf or _is_leaf).items():
             try:
                 if self._take(table, key):
                     out[key] = read(value, key)
@@ -286,7 +286,7 @@ class Builder:
         return self._axes(table, given, lambda value, _: _values(value))
 
     def _distributions(self, table: str, given: Axes) -> dict[str, Distribution]:
-        return self._axes(table, given, lambda value, key: distribution(value, self.own(key)), _is_leaf)
+        return self._axes(table, given, lambda value, key: distribution(value, self.own(key)))
 
     def _correlated(self, given: Any) -> tuple[Correlated, ...]:
         groups = [given] if isinstance(given, dict) else given or []
@@ -336,18 +336,17 @@ def _values(given: Any) -> tuple[Any, ...]:
 
 
 def _is_leaf(value: Any) -> bool:
-    """Whether a table in [random] is a distribution, and not the tables of a key."""
-    words = {*NAMES, "percent", "kind", "dist", "distribution", "type"}
+    """Whether a table is a distribution or a corner, and not the tables of a key."""
+    words = {*NAMES, "percent", "kind", "dist", "distribution", "type", "low", "high", "min", "max"}
     return isinstance(value, dict) and bool(words & set(value))
 
 
 def flat(given: Mapping[str, Any], leaf: Any = lambda _: False, before: str = "") -> Settings:
-    """Keys with dots, whether they are quoted or stand as tables of tables."""
+    """Keys with dots: quoted, then what they have is a value, or as tables of tables."""
     out: Settings = {}
     for name, value in given.items():
         key = before + name.strip()
-        deeper = isinstance(value, dict) and not leaf(value)
-        deeper = deeper and not ({"low", "high", "min", "max"} & set(value) or not value)
+        deeper = isinstance(value, dict) and value and "." not in name and not leaf(value)
         out |= flat(value, leaf, f"{key}.") if deeper else {key: value}
     return out
 

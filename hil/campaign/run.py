@@ -14,6 +14,7 @@ from hil.campaign import engine, store
 from hil.campaign.case import CaseJob, Stand, job_of
 from hil.campaign.engine import Rate, Workers
 from hil.campaign.figures import KEYS
+from hil.campaign.page import page
 from hil.campaign.plan import PlanTable, read_plan
 from hil.campaign.store import Folder, Schema, kind_of
 from hil.errors import HilError
@@ -22,6 +23,7 @@ BATCH_TICKS: Final = 700_000
 """Ticks of a batch: about half a second of a core; what a lost worker takes along."""
 ALONE_TICKS: Final = 400_000
 """A campaign of fewer ticks is done sooner in this process than workers are started."""
+PAGE: Final = "report.html"
 TICK_S: Final = 0.6e-6
 ROW_BYTES: Final = 130
 Seen = Callable[[Rate], None]
@@ -51,6 +53,7 @@ class Result:
             "seconds": self.seconds,
             "cases_per_s": self.cases_per_s,
             "folder": str(self.folder.path),
+            "report": str(self.folder.path / PAGE),
         }
 
     def rows(self) -> list[dict[str, Any]]:
@@ -80,6 +83,7 @@ def about_of(job: CaseJob, stand: Stand) -> dict[str, Any]:
         "config": job.config,
         "count": stand.plan.count,
         "schema": schema_of(stand),
+        "limits": stand.limits,
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in job.files},
     }
 
@@ -176,7 +180,18 @@ def finish(job: Any, held: Folder, used: Workers, size: int, seen: Seen | None) 
     with _kept(held):
         engine.run(job, engine.batches(held.open_spans(), size), used, take)
     passed = held.columns("passed")["passed"]
+    write_page(held)
     return Result(held, len(passed), int(passed.astype(bool).sum()), rate.seconds, rate.per_s)
+
+
+def write_page(held: Folder) -> Path:
+    """The report of a folder's rows, beside them. Raises HilError."""
+    target = held.path / PAGE
+    try:
+        target.write_text(page(held), encoding="utf-8")
+    except OSError as error:
+        raise HilError(store.full(held.path / store.ROWS / PAGE, error)) from error
+    return target
 
 
 @contextlib.contextmanager

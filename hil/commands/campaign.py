@@ -47,6 +47,12 @@ def register(commands: Commands) -> None:
         "--dry-run", action="store_true", help="say how many cases, how long, how large; run none"
     )
     command.add_argument("--case", type=int, metavar="N", help="run case N alone and print its row")
+    command.add_argument(
+        "--compare", action="store_true", help="instead: two folders of campaigns, DIR BEFORE AFTER"
+    )
+    command.add_argument(
+        "--what-if", type=Path, metavar="NEW", help="instead: the controller of NEW over logs, open loop"
+    )
     command.add_argument("--strict", action="store_true", help="exit code 1 unless every case passes")
 
 
@@ -54,8 +60,12 @@ def cmd_campaign(args: argparse.Namespace) -> int:
     """Run a campaign."""
     from hil.errors import HilError
 
+    if args.compare:
+        return _compare(args)
+    if args.what_if:
+        return _what_if(args)
     if len(args.what) != 1:
-        raise HilError("hil campaign takes one PLAN")
+        raise HilError(f"hil campaign takes one PLAN, not {len(args.what)}")
     if args.dry_run:
         return _dry_run(args)
     if args.case is not None:
@@ -106,6 +116,43 @@ def _run(args: argparse.Namespace) -> int:
     else:
         show(key_values(f"hil campaign {args.what[0].name}", result.as_dict()))
     return EXIT_FAILED if args.strict and result.failed else 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Exit code 1 when a case that passed before does not any more."""
+    from hil.campaign.compare import compare
+    from hil.campaign.view import compare_tables
+    from hil.errors import HilError
+    from hil.view import show
+
+    if len(args.what) != 2:
+        raise HilError("--compare takes two folders, that of before and that of after")
+    found = compare(*args.what)
+    if args.json:
+        print_json(found)
+    else:
+        for table in compare_tables(found):
+            show(table)
+    return EXIT_FAILED if found.get("regressions") else 0
+
+
+def _what_if(args: argparse.Namespace) -> int:
+    from hil.campaign.fleet import counts, fleet
+    from hil.campaign.view import what_if_table
+    from hil.view import show
+
+    options: dict[str, Any] = {"workers": args.workers, "scheduler": args.scheduler, "resume": args.resume}
+    with progress("logs") as seen:
+        rows, _ = fleet(
+            [str(path) for path in args.what], config=args.what_if, folder=args.output, **options, seen=seen
+        )
+    if args.json:
+        folder = None if args.output is None else str(args.output)
+        print_json({**counts(rows), "folder": folder, "open_loop": True, "rows": rows})
+    else:
+        show(what_if_table(rows))
+        say("open loop: the motors answered to the logged commands, not to these")
+    return EXIT_FAILED if any(row["verdict"] == "cannot" for row in rows) else 0
 
 
 @contextlib.contextmanager

@@ -18,7 +18,15 @@ TEXT = "Re-run the controller over LOG; exit 0 same to the bit, 1 differs, 2 can
 def register(commands: Commands) -> None:
     """Add what this module offers."""
     command = commands.add("replay", cmd_replay, TEXT)
-    command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="MCAP files of hil")
+    command.add_argument("logs", nargs="*", type=Path, metavar="LOG", help="MCAP files of hil")
+    command.add_argument(
+        "--fleet",
+        nargs="+",
+        metavar="GLOB|DIR",
+        help="verdict and figures of many logs, on all cores; -o DIR: as Parquet",
+    )
+    command.add_argument("-j", "--workers", type=int, metavar="N", help="with --fleet: local processes")
+    command.add_argument("--resume", action="store_true", help="with --fleet -o: go on with that folder")
     command.add_argument(
         "--from",
         dest="start",
@@ -35,7 +43,13 @@ def register(commands: Commands) -> None:
         metavar="NEW",
         help="instead: what the controller of NEW would have estimated and asked for (open loop)",
     )
-    command.add_argument("-o", "--output", type=Path, metavar="FILE", help="with --config: its ticks as MCAP")
+    command.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE",
+        help="with --config: its ticks as MCAP; with --fleet: a folder of rows",
+    )
 
 
 def cmd_replay(args: argparse.Namespace) -> int:
@@ -44,6 +58,10 @@ def cmd_replay(args: argparse.Namespace) -> int:
     from hil.log.parts import grouped
     from hil.replay import Window
 
+    if args.fleet:
+        return _fleet(args)
+    if not args.logs:
+        raise HilError("name one or more logs, or --fleet with a folder or a pattern")
     end = float("inf") if args.end is None else args.end
     if args.config:
         if args.junit or args.start or args.end is not None:
@@ -94,6 +112,29 @@ def _report(args: argparse.Namespace, results: list[tuple[Path, Verdict, float]]
         print_json(results[0][1].as_dict())
     else:
         print_json({"rows": [{"log": str(path)} | verdict.as_dict() for path, verdict, _ in results]})
+
+
+def _fleet(args: argparse.Namespace) -> int:
+    """The worst verdict of all is the exit code."""
+    from hil.campaign.fleet import counts, fleet
+    from hil.campaign.view import fleet_table
+    from hil.commands.campaign import progress as rate
+    from hil.errors import HilError
+    from hil.view import show
+
+    if args.config or args.junit or args.start or args.end is not None:
+        raise HilError(
+            "--fleet takes no --config, --junit, --from or --to; hil campaign --what-if tries a config"
+        )
+    places = [*args.fleet, *map(str, args.logs)]
+    with rate("logs") as seen:
+        rows, _ = fleet(places, folder=args.output, workers=args.workers, resume=args.resume, seen=seen)
+    if args.json:
+        folder = None if args.output is None else str(args.output)
+        print_json({**counts(rows), "folder": folder, "rows": rows})
+    else:
+        show(fleet_table(rows))
+    return max(({"same": 0, "differs": 1}.get(row["verdict"], 2) for row in rows), default=0)
 
 
 def _what_if(args: argparse.Namespace) -> int:
