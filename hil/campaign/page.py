@@ -146,7 +146,7 @@ def _limits(held: Folder) -> dict[str, float]:
 
 def _importance(held: Folder, main: Sequence[str]) -> str:
     """Bars of rank correlation, a plot a figure."""
-    keys = summary.varied(held)
+    keys = [key for key in summary.varied(held) if not summary.follows(held, key)]
     plots = []
     for key in main if keys else []:
         figure = summary.figure_of(held, key)
@@ -230,7 +230,7 @@ def _cells(key: str, names: tuple[str, str], axes: list[tuple[Any, list[str]]], 
     if not len(known):
         return ""
     low, span = float(known.min()), float(np.ptp(known)) or 1.0
-    w, h, left = 340 / shape[1], 260 / shape[0], 70
+    w, h, left = 300 / shape[1], 260 / shape[0], 110
     cells = ""
     for i, value in enumerate(mean.tolist()):
         row, column = divmod(i, shape[1])

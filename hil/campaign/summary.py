@@ -191,7 +191,7 @@ def law_axis(held: Folder) -> str | None:
 def paired(held: Folder, axis: str) -> dict[str, list[Difference]]:
     """For each law but the first, its figures less the first's, over cases that differ in nothing else."""
     labels = held.columns(axis)[axis].astype(str)
-    other = [key for key in varied(held) if key != axis and not _follows(held, key, axis)]
+    other = [key for key in varied(held) if key != axis and not (axis == "variant" and follows(held, key))]
     same = _groups(held, [*other, "sample"])
     names = list(dict.fromkeys(labels.tolist()))
     out: dict[str, list[Difference]] = {}
@@ -202,10 +202,10 @@ def paired(held: Folder, axis: str) -> dict[str, list[Difference]]:
     return out
 
 
-def _follows(held: Folder, key: str, axis: str) -> bool:
+def follows(held: Folder, key: str) -> bool:
     """Whether a key is set by the variant, so that it differs with it."""
     variants = json.loads(held.about["plan"])["variants"]
-    return axis == "variant" and any(key in flat(keys) for keys in variants.values())
+    return any(key in flat(keys) for keys in variants.values())
 
 
 def _groups(held: Folder, keys: Sequence[str]) -> npt.NDArray[np.int64]:
