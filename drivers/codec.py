@@ -245,9 +245,10 @@ class Database:
     since a third-party file holds many that no one maps. ``messages`` holds the usable ones.
     """
 
-    def __init__(self, path: Path, node_id: int = 1, rule: str = "") -> None:
+    def __init__(self, path: Path, node_id: int = 1, rule: str = "", text: str | None = None) -> None:
+        """``text``: what the file holds, where it is known; then ``path`` is but a name in messages."""
         self.path, self.node = path, NodeRule(node_id, rule)
-        self.text = read_text(path)
+        self.text = read_text(path) if text is None else text
         self._statements = Statements(self.text)
         self._compiled: dict[str, Message | DatabaseError] = {}
         self._names: dict[int, list[str]] = {}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from drivers.binding import Binding
 from drivers.bus import open_link
@@ -15,6 +15,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
+from hil.errors import plain
 from hil.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
 
@@ -62,7 +63,8 @@ def check_table(rows: list[Row]) -> Table:
     for title in ("check", "verdict", "found", "remedy"):
         table.add_column(title, overflow="fold")
     for r in rows:
-        table.add_row(r.check, f"[{STYLES[r.verdict]}]{r.verdict}[/]", escape(r.found), escape(r.remedy))
+        verdict = Text(r.verdict, style=STYLES[r.verdict])
+        table.add_row(r.check, verdict, Text(plain(r.found)), Text(plain(r.remedy)))
     return table
 
 

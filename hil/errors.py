@@ -18,3 +18,8 @@ class ConfigError(HilError, ValueError):
 
 class ArmingError(HilError, RuntimeError):
     """Arming was refused; nothing has been sent."""
+
+
+def plain(text: str) -> str:
+    """Text from a log or a path for a terminal: control characters, which could command it, are replaced."""
+    return "".join(c if c.isprintable() or c in "\n\t" else "\N{REPLACEMENT CHARACTER}" for c in text)

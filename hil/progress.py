@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 
 from hil.clock import RealClock
+from hil.errors import plain
 from hil.log.ring import RingError, attach
 from hil.signals import DriveState, ticks_from
 
@@ -20,7 +21,7 @@ REFRESH_NS = 100_000_000
 
 def say(text: str) -> None:
     """One plain line on standard error."""
-    print(f"hil: {text}", file=sys.stderr, flush=True)  # noqa: T201
+    print(plain(f"hil: {text}"), file=sys.stderr, flush=True)  # noqa: T201
 
 
 @contextlib.contextmanager

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 Kind = Literal["f8", "u8", "i8", "u4", "i4"]
-Role = Literal["time", "input", "output"]
+Role = Literal["time", "input", "output", "check"]
 TickArray = npt.NDArray[np.void]
 """A one-element (or longer) structured array of dtype :data:`TICK`."""
 
@@ -159,6 +159,14 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(6, "sent_ns", "i4", "ns", "time", "command handed to the bus, after the deadline"),
     Field(7, "skipped", "u4", "", "time", "whole periods skipped before this tick"),
     Field(8, "recorded_ns", "i4", "ns", "time", "previous tick's record stored, after that tick's deadline"),
+    Field(
+        9,
+        "check",
+        "u8",
+        "",
+        "check",
+        "sum over the other fields when the record was written (docs/log-format.md)",
+    ),
     Field(16, "rx_flags", "u4", "", "input", "RxFlag bits"),
     Field(17, "gap", "u4", "", "input", "periods since the previous tick (1 unless periods were skipped)"),
     Field(18, "w", "f8", "rad/s", "input", "measured mechanical speed"),

@@ -8,9 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
+from rich.text import Text
 
+from hil.errors import plain
 from hil.signals import Reason
 
 if TYPE_CHECKING:  # a table must not wait for the compiler and the bus
@@ -29,18 +32,23 @@ def show(table: Table) -> None:
 
 def key_values(title: str, values: dict[str, Any]) -> Table:
     """A two-column table."""
-    table = Table(title=title, title_justify="left", show_header=False)
+    table = Table(title=words(title), title_justify="left", show_header=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     for key, value in values.items():
-        table.add_row(key, _text(value))
+        table.add_row(words(key), _text(value))
     return table
 
 
-def _text(value: Any) -> str:
+def words(text: Any) -> Text:
+    """Text from a log, a path or a config as it stands: no markup, nothing that commands the terminal."""
+    return Text(plain(str(text)))
+
+
+def _text(value: Any) -> Text:
     if isinstance(value, float):
-        return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
-    return str(value)
+        return Text(f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}")
+    return words(value)
 
 
 def _number(value: float | None, unit: str, digits: int = 2) -> str:
@@ -117,7 +125,7 @@ def replay_table(results: list[tuple[Path, Verdict, float]]) -> Table:
         table.add_column(name, overflow="fold")
     table.add_column("s", justify="right")
     for path, verdict, seconds in results:
-        table.add_row(str(path), verdict_text(verdict.as_dict()), f"{seconds:.2f}")
+        table.add_row(words(path), words(verdict_text(verdict.as_dict())), f"{seconds:.2f}")
     return table
 
 
@@ -125,13 +133,13 @@ def sweep_table(rows: list[dict[str, Any]]) -> Table:
     """The cases of a sweep, one row each."""
     table = Table(title="hil simulate", title_justify="left")
     for setting in rows[0]["case"]:
-        table.add_column(setting.partition("=")[0])
+        table.add_column(words(setting.partition("=")[0]))
     table.add_column("ended")
     columns = {"tracking_rms_rad_s": "rad/s rms", "dip_rad_s": "rad/s", "recovery_ms": "ms", "i_max_a": "A"}
     for name in ("tracking", "dip", "recovery", "largest |i|"):
         table.add_column(name, justify="right")
     for row in rows:
-        values = [setting.partition("=")[2] for setting in row["case"]]
+        values = [words(setting.partition("=")[2]) for setting in row["case"]]
         numbers = [_number(row[key], unit) for key, unit in columns.items()]
         table.add_row(*values, row["ended"].replace("_", " "), *numbers)
     return table
@@ -139,7 +147,7 @@ def sweep_table(rows: list[dict[str, Any]]) -> Table:
 
 def what_if_table(found: WhatIf) -> Table:
     """How another controller differs from the one that ran."""
-    table = Table(title=f"{found.config.name} over {found.log.name}, open loop", title_justify="left")
+    table = Table(title=words(f"{found.config.name} over {found.log.name}, open loop"), title_justify="left")
     table.add_column("new - logged")
     for name in ("rms", "max", "ticks"):
         table.add_column(name, justify="right")
@@ -159,5 +167,5 @@ def progress(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
         yield lambda _: None
         return
     with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(text, total=total)
+        task = bar.add_task(escape(plain(text)), total=total)
         yield lambda done: bar.update(task, completed=done)

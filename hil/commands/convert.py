@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, one_run, print_json
+from hil.commands.common import Commands, one_run, output_file, print_json
 
 
 def register(commands: Commands) -> None:
@@ -39,9 +39,11 @@ def register(commands: Commands) -> None:
 
 def cmd_export(args: argparse.Namespace) -> int:
     """Write a log in another format."""
-    from hil.convert.export import export
+    from hil.convert.export import FORMATS, export
     from hil.view import key_values, show
 
+    if args.output.suffix.lower() in FORMATS:
+        output_file(args.output, *FORMATS)
     found = export(one_run(args.logs), args.output, frames=args.frames, force=args.force).as_dict()
     if args.json:
         print_json(found)
@@ -53,8 +55,11 @@ def cmd_export(args: argparse.Namespace) -> int:
 def cmd_import(args: argparse.Namespace) -> int:
     """Write a recording as a log."""
     from hil.convert.importing import import_recording
+    from hil.errors import HilError
     from hil.view import key_values, show
 
+    if args.output.exists() and args.recording.exists() and args.output.samefile(args.recording):
+        raise HilError(f"{args.output}: is the recording itself; name another file")
     options = {"channel": args.channel, "force": args.force, "partial": args.partial}
     found = import_recording(args.recording, args.output, args.config, tuple(args.set), **options).as_dict()
     if args.json:

@@ -38,7 +38,7 @@ def cmd_faults(args: argparse.Namespace) -> int:
     from hil.shipped import find_config
     from hil.view import show
 
-    html = output_file(args.html) if args.html else None
+    html = output_file(args.html, ".html", ".htm") if args.html else None
     shipped = find_config("faults.toml")
     matrix, path = load_matrix(args.config or shipped, shipped)
     folder = args.folder.resolve() / datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, one_run, print_json
+from hil.commands.common import Commands, one_run, output_log, print_json
 
 
 def register(commands: Commands) -> None:
@@ -38,7 +38,7 @@ def cmd_recover(args: argparse.Namespace) -> int:
     from hil.log.recover import recover
     from hil.view import key_values, show
 
-    out = args.output or args.log.with_suffix(".recovered.mcap")
+    out = output_log(args.output or args.log.with_suffix(".recovered.mcap"))
     found = recover(args.log, out).as_dict() | {"written": str(out)}
     if args.json:
         print_json(found)

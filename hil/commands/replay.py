@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, one_run, output_file, print_json, say
+from hil.commands.common import Commands, one_run, output_file, output_log, print_json, say
 
 if TYPE_CHECKING:
     from hil.replay import Verdict, Window
@@ -72,7 +72,7 @@ def cmd_replay(args: argparse.Namespace) -> int:
     if not 0 <= args.start < end:
         raise HilError(f"--from {args.start:g} --to {end:g}: no such window")
     if args.junit:
-        output_file(args.junit)
+        output_file(args.junit, ".xml")
     results = [_timed(paths, Window(args.start, end)) for paths in grouped(args.logs)]
     _report(args, results)
     return max(verdict.exit_code for _, verdict, _ in results)
@@ -143,7 +143,8 @@ def _what_if(args: argparse.Namespace) -> int:
     from hil.whatif import what_if
 
     config = load_toml(args.config, RunConfig, [])
-    found = what_if(one_run(args.logs), args.config, config, args.output)
+    out = output_log(args.output) if args.output else None
+    found = what_if(one_run(args.logs), args.config, config, out)
     if args.json:
         print_json(found.as_dict())
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, print_json
+from hil.commands.common import EXIT_FAILED, Commands, output_file, print_json
 
 
 def register(commands: Commands) -> None:
@@ -26,9 +26,8 @@ def cmd_report(args: argparse.Namespace) -> int:
     from hil.report.criteria import SIGNS, judge
     from hil.view import key_values, show
 
-    report = build(
-        grouped(args.log), args.output or args.log[0].with_suffix(".html"), verify=not args.no_replay
-    )
+    out = output_file(args.output or args.log[0].with_suffix(".html"), ".html", ".png")
+    report = build(grouped(args.log), out, verify=not args.no_replay)
     if args.json:
         print_json(report.as_dict())
     else:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from rich.table import Table
+from rich.text import Text
 
+from hil.errors import plain
 from hil.faults.judge import AS_EXPECTED, Result
 
 
@@ -24,11 +26,13 @@ def table(results: list[Result]) -> Table:
         out.add_column(name, overflow="fold")
     for r in results:
         good = r.verdict == AS_EXPECTED
-        verdict = f"[green]{r.verdict}[/]" if good else f"[red]{r.verdict}[/]: {'; '.join(r.why)}"
+        verdict = Text(r.verdict, style="green" if good else "red")
+        if not good:
+            verdict.append(plain(f": {'; '.join(r.why)}"), style="default")
         numbers = (number(r.time_to_safe_ms), number(r.w_worst_rad_s), number(r.i_worst_a, 2))
-        out.add_row(
-            r.fault, r.expected, r.reaction, *numbers, number(r.u_worst_v, 0), r.log, r.replay, verdict
-        )
+        said = [Text(plain(text)) for text in (r.fault, r.expected, r.reaction)]
+        found = [Text(plain(text)) for text in (r.log, r.replay)]
+        out.add_row(*said, *numbers, number(r.u_worst_v, 0), *found, verdict)
     return out
 
 

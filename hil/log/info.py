@@ -191,7 +191,7 @@ def _from_blocks(path: Path) -> Info:
             received = int((records["received"] != 0).sum())
             counts["/can/rx"] += received
             counts["/can/tx"] += len(records) - received
-    counts["/event"] = len(log.events)
+    counts["/event"] = log.event_count
     return Info(
         path=path,
         size=path.stat().st_size,

@@ -15,6 +15,7 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from hil.log.check import NAME, seal
 from hil.log.container import FIXED_BYTES, HEAD_BYTES, MESSAGE_HEAD, Block, Container, Integers
 from hil.log.schema import (
     FRAME,
@@ -99,6 +100,8 @@ class RunFile:
         self._head(messages, self._channels["/tick"], ticks["t_ns"], ticks["k"] & 0xFFFFFFFF)
         messages["length"] = FIXED_BYTES + layout.itemsize
         messages["data"] = logged_as(ticks, self._form).view(f"V{layout.itemsize}")
+        if NAME not in self._absent:
+            seal(messages["data"].view(layout), self._absent)
         lengths = np.full(len(ticks), message.itemsize, np.int64)
         self._ticks.add(messages["channel"].astype(np.int64), ticks["t_ns"], lengths, messages.tobytes())
         if self._ticks.size + message.itemsize > self._limit:

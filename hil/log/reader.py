@@ -45,6 +45,9 @@ Source = Path | Sequence[Path]
 MEMORY_SHARE: Final = 0.5
 SLAB_TICKS: Final = 1 << 17  # 48 MB, above the size up to which malloc keeps freed memory
 _WHOLE: Final = np.dtype(f"V{TICK.itemsize}")  # copied at once, where TICK is copied field by field
+EVENTS_MOST: Final = 100_000
+"""A run of a day has some thousands."""
+EVENT_TEXT_MOST: Final = 4096
 FRAME_OBJECT_RATIO: Final = 4  # a Frame object over its 78-byte record
 
 
@@ -77,6 +80,8 @@ class Log:
     damage: str | None = None
     bytes_lost: int = 0
     tick_count: int = 0
+    event_count: int = 0
+    """Events in the file; of very many the first are in ``events``."""
     last_t_ns: int | None = None
     parts: tuple[Path, ...] = ()
     """The files of a run that was split, in order; none for a run in one file."""
@@ -287,7 +292,12 @@ class _Pass:
             t_ns, k, kind, text = unpack_event(raw)
         except ValueError as error:
             raise DamagedError(str(error)) from error
-        self.log.events.append({"t_ns": t_ns, "k": k, "kind": kind, "text": text})
+        self.log.event_count += 1
+        if len(self.log.events) < EVENTS_MOST:
+            kept = {"kind": kind[:EVENT_TEXT_MOST], "text": text[:EVENT_TEXT_MOST]}
+            self.log.events.append({"t_ns": t_ns, "k": k} | kept)
+        elif self.log.event_count == EVENTS_MOST + 1:
+            self.problems.append(f"it has more than {EVENTS_MOST} events; the rest is left out")
 
     def _ticks(self, ticks: TickArray) -> Block:
         """Count ticks."""
@@ -326,7 +336,7 @@ def _read_parts(log: Log) -> Iterator[Block]:
     """The files of a split run as one: header and kept state are the first part's, the result the last's."""
     damages = []
     for number, path in enumerate(log.parts):
-        part = Log(path, new_ticks(0), events=log.events)
+        part = Log(path, new_ticks(0), events=log.events, event_count=log.event_count)
         if number == 0:
             part.metadata, part.attachments = log.metadata, log.attachments
         for block in _read_file(part):
@@ -334,7 +344,7 @@ def _read_parts(log: Log) -> Iterator[Block]:
             log.last_t_ns = part.last_t_ns if part.last_t_ns is not None else log.last_t_ns
             log.tick_count += len(block.records) if block.kind == "ticks" else 0
             yield block
-        log.bytes_lost += part.bytes_lost
+        log.bytes_lost, log.event_count = log.bytes_lost + part.bytes_lost, part.event_count
         log.metadata.pop("result", None) if "result" not in part.metadata else log.metadata.update(
             result=part.metadata["result"]
         )

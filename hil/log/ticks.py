@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from hil.log.check import NAME, share
 from hil.log.container import MESSAGE_HEAD
 from hil.log.errors import DamagedError, LogError
 from hil.log.layouts import TICK_FIELDS_1
@@ -113,9 +114,11 @@ class Ticks:
         if self.form.shape == OWN:
             return records
         out = self._empty(len(records))
-        for number, name, _ in self.form.shape:
+        for number, name, _ in sorted(self.form.shape, key=lambda row: row[0] not in _BY_NUMBER):
             if number in _BY_NUMBER:
                 out[name] = records[name]
+            elif NAME not in self.form.absent:  # what is passed by is in no sum over what is kept
+                out[NAME] -= share(records[f"?{number}"], number)
         return out
 
     def _empty(self, count: int) -> TickArray:
@@ -133,13 +136,18 @@ class Ticks:
         for number, name, _ in self.form.shape:
             if number in _BY_NUMBER:
                 out[name] = 0
+        foreign = np.zeros(len(messages), np.uint64)
         for row, raw in enumerate(messages):
             for number, value in _fields(raw).items():
                 field = _BY_NUMBER.get(number)
+                if field is None and NAME not in self.form.absent:
+                    foreign[row] += share(np.frombuffer(value, f"<u{len(value)}"), number)[0]
                 if field is not None and field.name not in self.form.absent:
                     if len(value) != np.dtype(field.kind).itemsize:
                         raise DamagedError("tick records whose tags do not fit")
                     out[field.name][row] = np.frombuffer(value, f"<{field.kind}")[0]
+        if NAME not in self.form.absent:
+            out[NAME] -= foreign
         return out
 
 

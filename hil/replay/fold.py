@@ -10,6 +10,7 @@ import numpy.typing as npt
 from hil.control.jit import jit
 from hil.design import Machine
 from hil.kernel import step
+from hil.log.check import first_broken
 from hil.replay.verdict import Difference
 from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
 
@@ -70,3 +71,25 @@ def compare(logged: TickArray, again: TickArray, absent: frozenset[str] = frozen
     ours, theirs = logged[name][row : row + 1], again[name][row : row + 1]
     ulp = abs(int(bits(ours, _KINDS[name])[0]) - int(bits(theirs, _KINDS[name])[0]))
     return Difference(int(logged["k"][row]), name, float(ours[0]), float(theirs[0]), ulp)
+
+
+def ulp_between(logged: float, other: float, kind: str) -> int:
+    """Numbers between two values of a field."""
+    if kind != "f8":
+        return abs(int(logged) - int(other))
+    a, b = (int(bits(np.array([value]), kind)[0]) for value in (logged, other))
+    return abs(a - b)
+
+
+def broken(logged: TickArray, absent: frozenset[str]) -> Difference | None:
+    """The first tick that is not what was written, by the check that it carries."""
+    found = first_broken(logged, absent)
+    if found is None:
+        return None
+    ulp = ulp_between(found.logged, found.written, _KINDS[found.field])
+    return Difference(int(logged["k"][found.row]), found.field, found.logged, found.written, ulp)
+
+
+def earliest(*differences: Difference | None) -> Difference | None:
+    """The one of the earliest tick, of one tick the first that is given."""
+    return min((one for one in differences if one is not None), key=lambda one: one.tick, default=None)

@@ -14,7 +14,7 @@ from hil.errors import HilError
 from hil.log.reader import Log, Source, new_log, read_blocks
 from hil.log.split import STATE
 from hil.log.ticks import nothing
-from hil.replay.fold import compare, refold
+from hil.replay.fold import broken, compare, earliest, refold
 from hil.replay.machine import Logged, logged_machine, restored
 from hil.replay.verdict import Difference, Verdict
 from hil.signals import FIELDS, TickArray
@@ -92,7 +92,10 @@ class Replay:
         if len(whole):
             again = refold(self.machine, whole)
             logged = self.window.of(whole, self.first_ns)
-            self.difference = compare(logged, self.window.of(again, self.first_ns), self.log.absent)
+            self.difference = earliest(
+                broken(logged, self.log.absent),
+                compare(logged, self.window.of(again, self.first_ns), self.log.absent),
+            )
             self.ticks, self.compared = self.ticks + len(whole), self.compared + len(logged)
             self.last_k = int(whole["k"][-1])
         past = len(whole) > 0 and (int(whole["t_ns"][-1]) - self.first_ns) * 1e-9 > self.window.end_s

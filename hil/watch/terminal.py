@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hil.arming import keys_at_once
+from hil.errors import plain
 from hil.signals import TickArray
 from hil.watch.look import Event, Look, figures, outcome
 from hil.watch.registry import Entry
@@ -87,7 +88,7 @@ def _state(look: Look, ticks: TickArray) -> Text:
 def _events(events: list[Event], entry: Entry) -> Text:
     """The newest events, one a line."""
     lines = [f"tick {k:<8d} {kind:12s} {text}" for _, k, kind, text in events]
-    return Text("\n".join(lines) or f"no events yet on {entry.bus}", overflow="ellipsis", no_wrap=True)
+    return Text(plain("\n".join(lines)) or f"no events yet on {entry.bus}", overflow="ellipsis", no_wrap=True)
 
 
 def frame(look: Look, width: int, note: str = "") -> RenderableType:
@@ -100,10 +101,13 @@ def frame(look: Look, width: int, note: str = "") -> RenderableType:
         curves(ticks, width),
         Text(""),
         _events(look.events(5), entry),
-        Text(f"\nlog {entry.log}", style="dim", overflow="fold"),
+        Text(plain(f"\nlog {entry.log}"), style="dim", overflow="fold"),
     )
     return Panel(
-        body, title=f"hil run  PID {entry.pid}  {entry.bus}", subtitle=note or None, title_align="left"
+        body,
+        title=Text(plain(f"hil run  PID {entry.pid}  {entry.bus}")),
+        subtitle=note or None,
+        title_align="left",
     )
 
 

@@ -70,7 +70,7 @@ class Web:
 
     def respond(self, _: ServerConnection, request: Request) -> Response | None:
         """Answer a request; None lets a WebSocket begin."""
-        if request.headers.get("Host") not in self._hosts():
+        if _only(request, "Host") not in self._hosts():
             return _response(HTTPStatus.FORBIDDEN, b"another host name\n")
         token, slash, name = request.path.partition("?")[0].removeprefix("/").partition("/")
         if not self._is_token(token) or not slash:
@@ -84,7 +84,7 @@ class Web:
 
     def _refusal(self, request: Request) -> Response | None:
         """Why a viewer may not come."""
-        origin = request.headers.get("Origin")
+        origin = _only(request, "Origin")
         if origin not in {None, *(f"http://{host}" for host in self._hosts())}:
             return _response(HTTPStatus.FORBIDDEN, b"another page\n")
         full = len(self._viewers) >= MAX_VIEWERS
@@ -158,6 +158,12 @@ class Viewer:
                     await connection.send(message)
         except ConnectionClosed:
             return
+
+
+def _only(request: Request, name: str) -> str | None:
+    """The value of a header, None where there is none; of several, which no browser sends, none alone."""
+    values = request.headers.get_all(name)
+    return ", ".join(values) if values else None
 
 
 def _response(status: HTTPStatus, body: bytes, kind: str = "text/plain") -> Response:

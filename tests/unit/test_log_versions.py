@@ -19,6 +19,7 @@ from google.protobuf.message_factory import GetMessageClass
 from hil.control.law import LAW_NEUTRAL, LAW_PARAMS, LAW_STATE
 from hil.control.references import REFERENCE, REFERENCE_NEUTRAL
 from hil.guard import SAFETY_NEUTRAL, SAFETY_PARAMS, SAFETY_STATE
+from hil.log.check import first_broken, share, sums
 from hil.log.container import Block, Container
 from hil.log.info import info
 from hil.log.layouts import FORMAT_1, TICK_FIELDS_1
@@ -161,12 +162,14 @@ def test_fields_that_are_not_known_are_skipped_and_those_lacking_are_absent(tmp_
     ticks = some_ticks(50)
     lacks = ("T_L_hat", "filled", "lateness_ns")
     has = ((15, "older", "u4", 7), (900, "newer", "f8", 1.5))
+    ticks["check"] = sums(ticks, lacks) + share(np.full(50, 7, "<u4"), 15) + share(np.full(50, 1.5), 900)
     log = open_log(other_version(tmp_path / "a.mcap", ticks, lacks=lacks, has=has))
     assert log.damage is None and log.absent == set(lacks) and log.unknown == ("older", "newer")
     assert all(np.isnan(log.ticks["T_L_hat"])) and not log.ticks["filled"].any()
     for field in FIELDS:
-        if field.name not in lacks:
+        if field.name not in (*lacks, "check"):
             assert log.ticks[field.name].tobytes() == ticks[field.name].tobytes(), field.name
+    assert first_broken(log.ticks, log.absent) is None, "the check holds over what is kept"
     assert set(log.to_numpy().dtype.names or ()) == {f.name for f in FIELDS} - set(lacks)
 
 

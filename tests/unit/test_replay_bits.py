@@ -1,0 +1,109 @@
+"""Replay sees every bit: one that changed in a tick or a received frame is found, tick and field named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hil.app import Overrides, load_setup
+from hil.log.check import first_broken, seal, sums
+from hil.log.mcapfile import RunFile
+from hil.log.reader import Log, open_log
+from hil.replay import replay, replay_log
+from hil.signals import FIELDS, TickArray, new_ticks
+from hil.simulate import simulate
+from tests.conftest import CONFIGS
+from tests.logfiles import some_ticks
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bits")
+    settings = (f'log.folder="{folder}"', "loop.duration_s=1.0")
+    return Path(simulate(load_setup(CONFIGS / "demo.toml", Overrides(settings=settings)), [])["log"])
+
+
+def flipped(ticks: TickArray, row: int, name: str, bit: int) -> TickArray:
+    """A copy with one bit of one field turned over."""
+    out = ticks.copy()
+    out.view(np.uint8).reshape(len(out), -1)[row, out.dtype.fields[name][1] + bit // 8] ^= 1 << bit % 8
+    return out
+
+
+def rewritten(path: Path, log: Log, ticks: TickArray) -> Path:
+    """The log written anew with other ticks, as any program may that uses our writer."""
+    path.unlink(missing_ok=True)
+    with RunFile(path, {"metadata": log.metadata["run"], "attachments": log.attachments}) as file:
+        file.add_ticks(ticks)
+        file.finish(log.result)
+    return path
+
+
+def test_600_of_600_bits_of_currents_are_found_without_frames(simulated: Path, tmp_path: Path) -> None:
+    log, rng = open_log(simulated), np.random.default_rng(600)
+    whole = log.ticks
+    for number in range(600):
+        row, name, bit = int(rng.integers(len(whole))), str(rng.choice(["i_q", "i_d"])), int(rng.integers(64))
+        log.ticks = flipped(whole, row, name, bit)
+        found = first_broken(log.ticks, log.absent)
+        assert found is not None and (found.row, found.field) == (row, name), (row, name, bit)
+        if number % 60 == 0:
+            for verdict in (replay_log(log), replay(rewritten(tmp_path / "a.mcap", log, log.ticks))):
+                first = verdict.first_difference
+                assert first is not None and (first.tick, first.field) == (row, name), verdict
+
+
+@pytest.mark.parametrize("name", [f.name for f in FIELDS])
+def test_a_bit_of_any_field_is_found_and_placed(name: str) -> None:
+    ticks = some_ticks(30)
+    ticks["check"] = 0
+    seal(ticks)
+    bit = 8 * ticks.dtype[name].itemsize - 1
+    for at in (0, 1, bit):
+        found = first_broken(flipped(ticks, 17, name, at), frozenset())
+        assert found is not None and (found.row, found.field) == (17, name)
+        assert found.written == ticks[name][17] or name == "check"
+
+
+def test_negative_zero_is_not_zero() -> None:
+    ticks = new_ticks(3)
+    seal(ticks)
+    ticks["i_d"][1] = -0.0
+    found = first_broken(ticks, frozenset())
+    assert found is not None and found.field == "i_d" and str(found.logged) == "-0.0"
+
+
+def test_several_changed_fields_are_found_too() -> None:
+    ticks = some_ticks(30)
+    ticks["check"] = 0
+    seal(ticks)
+    ticks["w"][3], ticks["u_q"][3] = 1.25, 2.5
+    found = first_broken(ticks, frozenset())
+    assert found is not None and found.row == 3 and found.field == "check"
+
+
+def test_the_check_is_the_sum_that_the_page_says() -> None:
+    ticks = some_ticks(2)
+    total = 0
+
+    def odd(seed: int) -> int:
+        z = seed * 0x9E3779B97F4A7C15 % 2**64
+        z = (z ^ z >> 30) * 0xBF58476D1CE4E5B9 % 2**64
+        z = (z ^ z >> 27) * 0x94D049BB133111EB % 2**64
+        return (z ^ z >> 31) | 1
+
+    for field in FIELDS:
+        if field.name != "check":
+            high, low = divmod(int.from_bytes(ticks[field.name][:1].tobytes(), "little"), 2**32)
+            total += low * odd(2 * field.number) + high * odd(2 * field.number + 1)
+    assert int(sums(ticks)[0]) == total % 2**64
+
+
+def test_a_record_keeps_its_check_and_gets_one_where_it_has_none() -> None:
+    ticks = some_ticks(4)
+    ticks["check"] = [5, 0, 0, 7]
+    expected = sums(ticks)
+    seal(ticks)
+    assert ticks["check"].tolist() == [5, int(expected[1]), int(expected[2]), 7]
