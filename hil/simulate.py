@@ -31,6 +31,8 @@ from hil.log.recorder import check_folder
 from hil.log.split import SplitFile, open_run
 from hil.loop import transition_event
 from hil.reasons import explain
+from hil.report.segments import Responses
+from hil.report.statistics import Totals
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.snapshot import StateFollower
 
@@ -194,14 +196,15 @@ def simulate(
         file: RunFile | SplitFile | None = open_run(path, header, StateFollower) if log else None
         if file:
             stack.enter_context(file)
-        last, count, stop = _through(simulation, file, seen or (lambda _: None))
+        figures = Figures(setup)
+        last, count, stop = _through(simulation, file, figures, seen or (lambda _: None))
         reason = Reason(int(last["reason"]))
         machine = simulation.machine
         end = None if stop is None else explain(machine.safety, machine.safety_state, stop)
         why = {"end": end.as_dict()} if end else {}
         if file:
             file.finish({"ended": reason.name.lower(), "ticks": count, "skipped": 0, **why})
-    wall_s = time.perf_counter() - start
+    wall_s = time.perf_counter() - start - figures.seconds
     simulated_s = count * setup.config.loop.period_ns * 1e-9
     return {
         "log": str(path) if log else None,
@@ -209,14 +212,43 @@ def simulate(
         "ended": reason.name.lower(),
         "end": end.as_dict() if end else None,
         "ok": reason == Reason.STOP_REQUESTED,
+        **figures.as_dict(),
         "simulated_s": simulated_s,
         "wall_s": wall_s,
         "x_realtime": simulated_s / wall_s,
     }
 
 
+class Figures:
+    """What a run achieved, by the report's rules, block by block; ``seconds``: what that took."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._totals, self._responses = Totals(), Responses()
+        self._responses.N = int(setup.machine.law["N"][0, 0])
+        self.seconds = 0.0
+
+    def feed(self, ticks: TickArray) -> None:
+        """Take the next ticks."""
+        begin = time.perf_counter()
+        t = ticks["t_ns"] * 1e-9
+        self._responses.feed(t, ticks)
+        self._totals.feed(t, ticks)
+        self.seconds += time.perf_counter() - begin
+
+    def as_dict(self) -> dict[str, float | None]:
+        """Tracking [rad/s rms], worst dip after a load step [rad/s], slowest recovery [s]; None: no data."""
+        self._responses.finish()
+        worst = self._responses.worst
+        never = "recovery_s" in self._responses.unfinished
+        return {
+            "tracking_rms_rad_s": self._totals.tracking_rms,
+            "dip_rad_s": worst.get("dip"),
+            "recovery_s": None if never else worst.get("recovery_s"),
+        }
+
+
 def _through(
-    simulation: Simulation, file: RunFile | SplitFile | None, seen: Callable[[int], None]
+    simulation: Simulation, file: RunFile | SplitFile | None, figures: Figures, seen: Callable[[int], None]
 ) -> tuple[Any, int, Any]:
     """Run to the end, ticks and changes of state into the file.
 
@@ -232,6 +264,7 @@ def _through(
             file.add_ticks(ticks)
         state = int(ticks["state"][-1])
         last, count = ticks[-1].copy(), count + len(ticks)
+        figures.feed(ticks)
         if stop is None and last["reason"]:
             stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
         seen(count)

@@ -10,7 +10,7 @@ from typing import Any, Final
 from hil.errors import HilError
 from hil.log.reader import Source
 from hil.report.collect import Run, collect
-from hil.report.criteria import figures, judge, open_loop
+from hil.report.criteria import figures, judge, notes, open_loop
 from hil.report.page import page
 
 MOST_LOGS: Final = 8
@@ -40,6 +40,7 @@ class Report:
                     "ticks": run.totals.ticks,
                     "checks": [check.as_dict() for check in judge(run)],
                     "figures": figures(run),
+                    "notes": notes(run),
                     "end": run.end,
                     "replay": run.verdict.as_dict(),
                     "damage": run.log.damage,

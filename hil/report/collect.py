@@ -17,6 +17,7 @@ from hil.reasons import explain
 from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
+from hil.report.excursions import Excursions
 from hil.report.frames import Frames, FrameTime, names_of
 from hil.report.segments import Responses
 from hil.report.statistics import Phases, Spectrum, Totals
@@ -39,6 +40,7 @@ class Run:
     phases: Phases = field(default_factory=Phases)
     spectrum: Spectrum = field(default_factory=Spectrum)
     responses: Responses = field(default_factory=Responses)
+    excursions: Excursions = field(default_factory=Excursions)
     frames: Frames = field(default_factory=Frames)
     envelope: Envelope = field(default_factory=lambda: Envelope(len(CURVES)))
     close_ups: CloseUps = field(default_factory=CloseUps)
@@ -64,6 +66,7 @@ class Run:
         self.envelope.feed(t, values)
         self.close_ups.feed(t, values, sorted(steps + ends))
         self.totals.feed(t, ticks)
+        self.excursions.feed(t, ticks)
         if self.stop is None and ticks["reason"].any():
             self.stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
         self.phases.feed(ticks)

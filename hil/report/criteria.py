@@ -44,6 +44,31 @@ def _worst(name: str) -> Callable[[Run], float | None]:
     return lambda run: float("inf") if name in run.responses.unfinished else run.responses.worst.get(name)
 
 
+def _dip(run: Run) -> float | None:
+    return run.excursions.dip if untold(run) else _worst("dip")(run)
+
+
+def _recovery(run: Run) -> float | None:
+    if not untold(run):
+        return _worst("recovery_s")(run)
+    return float("inf") if run.excursions.unfinished else run.excursions.recovery_s
+
+
+def untold(run: Run) -> bool:
+    """True for a log without the true load: dip and recovery come from estimate and reference."""
+    return run.totals.ticks > 0 and not run.excursions.truth
+
+
+def notes(run: Run) -> dict[str, str]:
+    """What to know of figures, by their keys."""
+    if not untold(run):
+        return {}
+    span = run.excursions.load_span
+    moved = "" if span is None else f"; the load estimate moved by {number(span, 'N m')}"
+    text = f"from estimate and reference, the log has no true load{moved}"
+    return dict.fromkeys(("dip_rad_s", "recovery_s"), text)
+
+
 def _lateness(name: str) -> Callable[[Run], float | None]:
     return lambda run: run.phases.lateness.as_dict()[name] if run.totals.ticks else None
 
@@ -67,8 +92,8 @@ def _busiest(run: Run) -> float | None:
 
 FIGURES: Final = (
     Figure("tracking_rms_rad_s", "tracking error, rms", "rad/s", lambda run: run.totals.tracking_rms),
-    Figure("dip_rad_s", "worst dip after a load step", "rad/s", _worst("dip")),
-    Figure("recovery_s", "slowest recovery to 0.5 rad/s", "s", _worst("recovery_s")),
+    Figure("dip_rad_s", "worst dip after a load step", "rad/s", _dip),
+    Figure("recovery_s", "slowest recovery to 0.5 rad/s", "s", _recovery),
     Figure("rise_s", "slowest rise, 10 to 90 %", "s", _worst("rise_s")),
     Figure("overshoot_percent", "largest overshoot", "%", _worst("overshoot_percent")),
     Figure("settling_s", "slowest settling to 2 %", "s", _worst("settling_s")),
@@ -160,7 +185,9 @@ def check_limit(run: Run, figure: Figure, most: float) -> Check:
     """The check of one figure."""
     value = figure.of(run)
     outcome: Outcome = "no data" if value is None else "pass" if value <= most else "fail"
-    return Check(figure.name, outcome, number(value, figure.unit), f"at most {number(most, figure.unit)}")
+    note = notes(run).get(figure.key)
+    found = number(value, figure.unit) + (f" ({note})" if note else "")
+    return Check(figure.name, outcome, found, f"at most {number(most, figure.unit)}")
 
 
 def _always(run: Run) -> list[Check]:

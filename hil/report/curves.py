@@ -54,6 +54,15 @@ def _lost(ticks: TickArray) -> Any:
     return (ticks["rx_flags"] & int(RxFlag.FRESH)) == 0
 
 
+def _until_stop(name: str, label: str, compared: bool = True, scale: float = 1.0) -> Curve:
+    """What means nothing once the run stops, and would then set the scale: estimates, times in a tick."""
+
+    def of(ticks: TickArray) -> Any:
+        return np.where(ticks["reason"] == 0, ticks[name] * scale, np.nan)
+
+    return Curve(name, label, of, compared)
+
+
 def _curve(name: str, label: str, compared: bool = True, scale: float = 1.0) -> Curve:
     return Curve(name, label, _field(name, scale), compared)
 
@@ -75,12 +84,12 @@ PLOTS: Final = (
     ),
     Plot(
         "load", "Load torque: true and estimated", "N m",
-        (_curve("T_L_true", "true"), _curve("T_L_hat", "estimate")),
+        (_curve("T_L_true", "true"), _until_stop("T_L_hat", "estimate")),
     ),
-    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²", (_curve("d_hat_w", "d_hat_w"),)),
+    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²", (_until_stop("d_hat_w", "d_hat_w"),)),
     Plot(
         "d_i", "Disturbance estimates, current channels", "A/s",
-        (_curve("d_hat_q", "d_hat_q"), _curve("d_hat_d", "d_hat_d", False)),
+        (_until_stop("d_hat_q", "d_hat_q"), _until_stop("d_hat_d", "d_hat_d", False)),
     ),
     Plot("filled", "Observer memory filled", "ticks", (_curve("filled", "filled"),), True),
     Plot(
@@ -90,8 +99,9 @@ PLOTS: Final = (
     Plot(
         "lateness", "After the deadline of the tick", "µs",
         (
-            _curve("sent_ns", "sent", False, 1e-3), _curve("computed_ns", "computed", False, 1e-3),
-            _curve("received_ns", "received", False, 1e-3), _curve("lateness_ns", "woken", True, 1e-3),
+            _until_stop("sent_ns", "sent", False, 1e-3), _until_stop("computed_ns", "computed", False, 1e-3),
+            _until_stop("received_ns", "received", False, 1e-3),
+            _until_stop("lateness_ns", "woken", True, 1e-3),
         ),
     ),
     Plot(
