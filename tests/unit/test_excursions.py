@@ -1,4 +1,4 @@
-"""Dip and recovery without the true load come from estimate and reference; ticks after a stop are left out."""
+"""Dip and recovery where nobody tells the true load, and scales that end with the stop."""
 
 from __future__ import annotations
 
