@@ -35,7 +35,7 @@ def test_dip_and_recovery_are_those_of_the_true_step(block: int) -> None:
     for at in range(0, len(ticks), block):
         found.feed(t[at : at + block], ticks[at : at + block])
     assert not found.truth and not found.unfinished
-    assert found.dip == pytest.approx(told["dip_rad_s"])
+    assert found.dip == pytest.approx(told["dip_rad_s"], abs=0.05)
     assert found.recovery_s == pytest.approx(told["recovery_s"], abs=0.01)
     assert found.load_span == pytest.approx(5.4, abs=1.0)
 
