@@ -7,6 +7,7 @@ appended whole or not at all: after a failed write the file is cut back to its l
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import zlib
@@ -90,6 +91,7 @@ class Container:
 
     def __init__(self, path: Path) -> None:
         self._fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        self._own = os.fstat(self._fd)
         self.size = 0
         self._compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
         self._schemas: list[McapRecord] = []
@@ -250,6 +252,15 @@ class Container:
             message_end_time=self._end,
             schema_count=len(self._schemas),
         )
+
+    def check_place(self, path: Path) -> None:
+        """Raise OSError when this is no longer the file of that name: deleted or moved, or its folder."""
+        try:
+            found: os.stat_result | None = path.stat()
+        except OSError:
+            found = None
+        if found is None or not os.path.samestat(found, self._own):
+            raise FileNotFoundError(errno.ENOENT, f"{path} was deleted or moved")
 
     def close(self) -> None:
         """Close the file as it is; closing twice is harmless."""

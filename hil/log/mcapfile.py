@@ -164,6 +164,10 @@ class RunFile:
             self._out.add_chunk(block)
         return Block()
 
+    def check_place(self, path: Path) -> None:
+        """Raise OSError when the file is no longer at its path, open or finished."""
+        self._out.check_place(path)
+
     def flush(self) -> None:
         """Close the chunks in the making and hand them to the operating system."""
         self._ticks = self._close(self._ticks)

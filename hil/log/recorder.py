@@ -7,6 +7,7 @@ import json
 import os
 import select
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -35,6 +36,8 @@ LOOK_NS: Final = 100_000_000
 WRITER_SILENT_NS: Final = 2_000_000_000
 START_TIMEOUT_S: Final = 60.0  # a log in parts loads the compiled law
 CLOSE_TIMEOUT_S: Final = 60.0
+HUNG_TIMEOUT_S: Final = 5.0
+"""How long a writer that was silent, or killed, is waited for."""
 
 
 def check_folder(path: Path, needed_bytes: int) -> None:
@@ -196,21 +199,27 @@ class Recorder:
         if self._closed:
             return not self._failed
         self._say(result)
-        complete = self._end_writer(CLOSE_TIMEOUT_S) == 0
+        complete = self._end_writer(HUNG_TIMEOUT_S if self._failed else CLOSE_TIMEOUT_S) == 0
         self._failed = self._failed or not complete
         self._release()
         return complete
 
     def _end_writer(self, timeout_s: float) -> int:
-        """End the writer's input and wait for it; kill it when that takes too long."""
+        """End the writer's input and wait for it; kill it when that takes too long.
+
+        One that was stopped (SIGSTOP) goes on, and what waits in the rings reaches the file.
+        """
         assert self._writer.stdin is not None and self._writer.stdout is not None  # noqa: S101 - PIPE
         with contextlib.suppress(BrokenPipeError):
             self._writer.stdin.close()
+        self._writer.send_signal(signal.SIGCONT)
         try:
             code = self._writer.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._writer.kill()
-            code = self._writer.wait()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # a disk that hangs holds it
+                self._writer.wait(HUNG_TIMEOUT_S)
+            code = -signal.SIGKILL
         self._writer.stdout.close()
         return code
 

@@ -144,6 +144,10 @@ class SplitFile:
         """Append the writer's own figures."""
         self._file.add_stats(t_ns, values)
 
+    def check_place(self, _: Path) -> None:
+        """Raise OSError when the part in the making is no longer at its path; earlier ones may be moved."""
+        self._file.check_place(part_path(self._path, self._number))
+
     def flush(self) -> None:
         """Close the chunks in the making."""
         self._file.flush()

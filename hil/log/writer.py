@@ -26,8 +26,9 @@ from hil.log.schema import FRAME
 from hil.log.split import Follower, SplitFile, open_run
 from hil.signals import TICK
 
-DRAIN_S: Final = 0.02
-CHUNK_S: Final = 0.5
+DRAIN_S: Final = 0.01
+CHUNK_S: Final = 0.04
+"""What a kill of everything may cost, together with two drains: under 100 ms. It makes a log 9 % larger."""
 STATS_S: Final = 1.0
 NICE: Final = 10
 Rings = tuple[Ring, Ring, Ring]
@@ -123,7 +124,7 @@ def read_opening() -> tuple[dict[str, Any], bytes] | None:
     return opening, rest
 
 
-def serve(rings: Rings, file: RunFile | SplitFile, control: bytes) -> dict[str, Any]:
+def serve(rings: Rings, file: RunFile | SplitFile, path: Path, control: bytes) -> dict[str, Any]:
     """Drain until standard input ends; return the result that the controller sent, if any."""
     drain, header = Drain(rings, file), rings[0].header
     chunk, stats = Every(CHUNK_S), Every(STATS_S)
@@ -134,6 +135,7 @@ def serve(rings: Rings, file: RunFile | SplitFile, control: bytes) -> dict[str, 
             drain.stats()
         if chunk.due():
             file.flush()
+            file.check_place(path)
         header[BEAT_AT] += 1
     drain.once(final=True)
     drain.stats()
@@ -168,13 +170,14 @@ def _follower(header: dict[str, Any]) -> Follower:
 
 def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
     """Write the file that ``opening`` names; 0 when it is complete."""
-    header, file = rings[0].header, None
+    header, file, path = rings[0].header, None, Path(opening["path"])
     try:
-        file = open_run(Path(opening["path"]), opening["header"], _follower, opening["chunk_bytes"])
+        file = open_run(path, opening["header"], _follower, opening["chunk_bytes"])
         header[BEAT_AT] += 1
         with contextlib.suppress(BrokenPipeError):  # a controller that was killed: its records are kept
             os.write(1, b"ready\n")
-        file.finish(serve(rings, file, control))
+        file.finish(serve(rings, file, path, control))
+        file.check_place(path)
     except OSError as error:
         header[FAILED_AT] = 1
         if file is None:

@@ -6,7 +6,9 @@ import contextlib
 import os
 import random
 import resource
+import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -180,6 +182,65 @@ def test_a_writer_that_hangs_is_a_failure_after_two_seconds(tmp_path: Path) -> N
         wait_for(lambda: not recorder.failed, 1)
         os.kill(recorder.writer_pid, signal.SIGSTOP)
         assert wait_for(lambda: recorder.failed, 10) > 1.5
+
+
+def test_a_writer_that_was_stopped_finishes_what_the_rings_hold(tmp_path: Path) -> None:
+    path, ticks = tmp_path / "run.mcap", some_ticks(700)
+    with recording(path) as recorder:
+        push(recorder, ticks[:200], 0.0005)
+        os.kill(recorder.writer_pid, signal.SIGSTOP)
+        push(recorder, ticks[200:])
+        wait_for(lambda: recorder.failed, 10)
+        begun = time.monotonic()
+        recorder.close({"ended": "log_failed"})
+        assert time.monotonic() - begun < 20.0, "it waited for the longest time"
+    log = open_log(path)
+    assert log.damage is None and log.ticks.tobytes() == ticks.tobytes()
+    assert log.result["ended"] == "log_failed"
+
+
+@pytest.mark.parametrize("how", ["folder deleted", "file deleted", "folder moved", "file replaced"])
+@pytest.mark.parametrize("late", [False, True])
+def test_a_log_that_is_no_longer_there_is_a_failure(tmp_path: Path, how: str, late: bool) -> None:
+    """Noticed while the run goes on, or at the latest when it is closed."""
+    path = tmp_path / "logs" / "run.mcap"
+    with recording(path) as recorder:
+        push(recorder, some_ticks(200), 0.0005)
+        if how == "folder deleted":
+            shutil.rmtree(path.parent)
+        elif how == "folder moved":
+            path.parent.rename(tmp_path / "elsewhere")
+        else:
+            path.unlink()
+        if how == "file replaced":
+            path.write_bytes(b"another's")
+        if not late:
+            wait_for(lambda: recorder.failed, 10)
+        assert not recorder.close({"ended": "stop_requested"}) and recorder.failed
+
+
+def lost_s(path: Path, lives_s: float) -> float:
+    """What is missing in the log [s] of a recorder whose writer is killed after so long."""
+    ticks, pushed_s, k = some_ticks(4000), [0.0] * 4000, 0
+    with recording(path) as recorder:
+        start = time.monotonic()
+        while (now := time.monotonic() - start) < lives_s:
+            recorder.tick(ticks[k : k + 1])
+            pushed_s[k] = now
+            k += 1
+            time.sleep(0.001)
+        os.kill(recorder.writer_pid, signal.SIGKILL)
+        killed_s = time.monotonic() - start
+        assert not recorder.close({})
+    kept = open_log(path).ticks
+    assert kept.tobytes() == ticks[: len(kept)].tobytes()
+    return killed_s - pushed_s[len(kept) - 1] if len(kept) else killed_s
+
+
+def test_a_kill_of_everything_costs_less_than_a_tenth_of_a_second(tmp_path: Path) -> None:
+    """Also early in the run. By the median: a busy machine may keep one writer from its chunk."""
+    lost = [lost_s(tmp_path / f"{k}.mcap", lives_s) for k, lives_s in enumerate((0.2, 0.3, 0.4, 0.6, 0.9))]
+    assert statistics.median(lost) < 0.1 and max(lost) < 1.0, lost
 
 
 def fill(recorder: Recorder) -> int:
