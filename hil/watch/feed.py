@@ -65,7 +65,14 @@ class Feed:
         ticks = self._look.new_ticks()
         if not self._look.alive:
             return self._lost(self._look)
-        return [self._data(self._look, ticks)] if len(ticks) else []
+        return [self._data(self._look, ticks)] if len(ticks) else self._silence(self._look)
+
+    def _silence(self, look: Look) -> list[str]:
+        """The figures of a loop that is silent, with their growing age."""
+        newest = figures(look, look.latest(look.entry.rate_hz))
+        if not newest.get("silent"):
+            return []
+        return [json.dumps(finite({"now": newest}), separators=(",", ":"), allow_nan=False)]
 
     def _find(self) -> list[str]:
         found = matching(self._wanted)

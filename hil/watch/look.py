@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hil.clock import RealClock
 from hil.log.errors import LogError
 from hil.log.info import info
 from hil.log.records import EVENT, EVENT_BYTES
@@ -15,6 +16,8 @@ from hil.log.ring import RingError, attach
 from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
 from hil.watch.registry import Entry, WatchError, ask_stop, is_alive
 
+SILENT_S, SILENT_PERIODS = 0.3, 3
+"""Age from which a tick is no longer news, and at least so many periods."""
 Event = tuple[int, int, str, str]
 """t_ns, tick, kind, text."""
 
@@ -46,11 +49,25 @@ class Look:
         except RingError as error:
             raise WatchError(str(error)) from error
         self._seen = self._events_seen = 0
+        self._published, self._changed_ns = -1, 0
 
     def new_ticks(self) -> TickArray:
         """The ticks since the last look, at most what the ring holds."""
         raw, self._seen = self._ticks.since(self._seen)
         return ticks_from(raw)
+
+    def age_s(self, ticks: TickArray) -> float:
+        """Age of the newest of ``ticks``; in lockstep, since this viewer saw it come."""
+        now_ns = RealClock().now_ns()
+        if self.entry.clock == RealClock.name:
+            return max(now_ns - int(ticks["t_ns"][-1]) - int(ticks["lateness_ns"][-1]), 0) * 1e-9
+        if self._ticks.published != self._published:
+            self._published, self._changed_ns = self._ticks.published, now_ns
+        return (now_ns - self._changed_ns) * 1e-9
+
+    def is_silent(self, age_s: float) -> bool:
+        """True when the newest tick is too old for a loop that runs: it hangs, or was stopped."""
+        return age_s > max(SILENT_S, SILENT_PERIODS / self.entry.rate_hz)
 
     def new_events(self) -> list[Event]:
         """The events since the last look."""
@@ -90,12 +107,17 @@ class Look:
 
 
 def figures(look: Look, ticks: TickArray) -> dict[str, Any]:
-    """Numbers of the newest ticks: SI units, lateness in us, rate in Hz (None before two ticks)."""
+    """Numbers of the newest ticks: SI units, lateness in us, rate in Hz (None before two ticks).
+
+    ``age_s`` is that of the newest; the rate of a loop that is silent is over the time until now.
+    """
     if not len(ticks):
         return {"k": 0, "state": "arming", "reason": "", "dropped": look.dropped}
     t = ticks[-1]
     late = np.percentile(ticks["lateness_ns"] * 1e-3, (50, 99, 100))
-    span_s = (int(t["t_ns"]) - int(ticks["t_ns"][0])) * 1e-9
+    age_s = look.age_s(ticks)
+    silent = look.is_silent(age_s)
+    span_s = (int(t["t_ns"]) - int(ticks["t_ns"][0])) * 1e-9 + (age_s if silent else 0.0)
     names = ("w", "w_ref", "i_q", "i_d", "u_q", "u_d", "T_L_hat", "v_dc")
     return {
         "k": int(t["k"]),
@@ -106,6 +128,8 @@ def figures(look: Look, ticks: TickArray) -> dict[str, Any]:
             name: round(float(v), 1) for name, v in zip(("p50", "p99", "max"), late, strict=True)
         },
         "rate_hz": round((len(ticks) - 1) / span_s, 1) if span_s > 0 else None,
+        "age_s": round(age_s, 3),
+        "silent": silent,
         "skipped": int(ticks["skipped"].sum()),
         "dropped": look.dropped,
     }

@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from hil.clock import RealClock
 from hil.errors import HilError
 
 TOKEN_BYTES: Final = 32
@@ -38,6 +39,7 @@ class Entry:
     bus: str
     rate_hz: int
     ticks: int | None = None
+    clock: str = "monotonic"
 
     def __str__(self) -> str:
         return f"PID {self.pid} on {self.bus}, log {self.log}"
@@ -49,12 +51,38 @@ def folder() -> Path:
     path = Path(base) / "hil" if base else Path(tempfile.gettempdir()) / f"hil-{os.getuid()}"
     try:
         path.mkdir(mode=0o700, exist_ok=True)
-        found = path.lstat()
+        own = _is_own(path)
     except OSError as error:
         raise WatchError(f"{path}: can't be used for the list of runs ({error.strerror})") from error
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+    if not own:
         raise WatchError(f"{path}: is not a folder that only this user can open; remove it")
     return path
+
+
+def _is_own(path: Path) -> bool:
+    """Whether it is a folder that only this user can open. Raises OSError when there is none."""
+    found = path.lstat()
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o077
+
+
+def elsewhere() -> list[Path]:
+    """Where runs list themselves that were started in another environment: by a system unit, by cron."""
+    user = os.getuid()
+    return [
+        Path(f"/run/user/{user}/hil"),
+        Path(tempfile.gettempdir()) / f"hil-{user}",
+        Path(f"/tmp/hil-{user}"),  # noqa: S108 - read only, and only a folder that is this user's alone
+    ]
+
+
+def folders() -> list[Path]:
+    """All folders in which a run of this user may be listed, this environment's own first."""
+    found = {folder(): None}
+    for path in elsewhere():
+        with contextlib.suppress(OSError):
+            if _is_own(path):
+                found[path] = None
+    return list(found)
 
 
 def start_time(pid: int) -> int | None:
@@ -97,9 +125,9 @@ def secret() -> str:
     return token
 
 
-def own_entry(log: Path, bus: str, rate_hz: int, ticks: int | None) -> Entry:
-    """The entry of this process."""
-    return Entry(os.getpid(), start_time(os.getpid()) or 0, str(log), bus, rate_hz, ticks)
+def own_entry(log: Path, bus: str, rate_hz: int, ticks: int | None, clock: str = RealClock.name) -> Entry:
+    """The entry of this process; ``clock``: the name of its loop's."""
+    return Entry(os.getpid(), start_time(os.getpid()) or 0, str(log), bus, rate_hz, ticks, clock)
 
 
 @contextlib.contextmanager
@@ -122,7 +150,7 @@ def announced(entry: Entry) -> Iterator[None]:
 def runs() -> list[Entry]:
     """All running runs of this user, oldest first; what is left of dead ones is removed."""
     found = []
-    for path in sorted(folder().glob("*.json")):
+    for path in sorted(path for place in folders() for path in place.glob("*.json")):
         entry = _read(path)
         if entry is not None and is_alive(entry):
             found.append(entry)
@@ -130,6 +158,12 @@ def runs() -> list[Entry]:
             path.unlink(missing_ok=True)
             path.with_suffix(".stop").unlink(missing_ok=True)
     return sorted(found, key=lambda entry: entry.start)
+
+
+def _listed(entry: Entry) -> Path | None:
+    """The file that lists a run."""
+    paths = [place / f"{entry.pid}.json" for place in folders()]
+    return next((path for path in paths if _read(path) == entry), None)
 
 
 def _read(path: Path) -> Entry | None:
@@ -183,15 +217,15 @@ def ask_stop(entry: Entry, who: str, t_ns: int, k: int) -> bool:
     The process is held by a pidfd before it is checked, so that the signal can't reach another one. A second
     signal would be a quick stop, hence the note that can be made only once.
     """
-    path = folder() / f"{entry.pid}.stop"
     try:
         fd = os.pidfd_open(entry.pid)
     except OSError:
         return False
     try:
-        if not is_alive(entry) or not path.with_suffix(".json").exists():
+        path = _listed(entry)
+        if not is_alive(entry) or path is None:
             return False
-        _write_new(path, {"who": who, "t_ns": t_ns, "k": k})
+        _write_new(path.with_suffix(".stop"), {"who": who, "t_ns": t_ns, "k": k})
         signal.pidfd_send_signal(fd, signal.SIGTERM)
     except (FileExistsError, ProcessLookupError):
         return False

@@ -76,7 +76,9 @@ def _state(look: Look, ticks: TickArray) -> Text:
         text.append(f"  ({reason.replace('_', ' ')})", style="bold yellow")
     total = f" of {look.entry.ticks}" if look.entry.ticks else ""
     text.append(f"   tick {now['k']}{total}")
-    if now.get("rate_hz"):
+    if now.get("silent"):
+        text.append(f"\nno tick for {now['age_s']:.1f} s: the loop hangs or is stopped", style="bold red")
+    elif now.get("rate_hz"):
         late = now["lateness_us"]
         text.append(f"   {now['rate_hz']:.0f} Hz of {look.entry.rate_hz}")
         text.append(f"\nlateness p50 {late['p50']:.0f}, p99 {late['p99']:.0f}, max {late['max']:.0f} us   ")

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
-from hil.log.records import pack_event_record
+from hil.log.records import EVENT_BYTES, pack_event_record
 from hil.log.ring import Ring
+from hil.signals import TICK, new_ticks
 from hil.watch import registry
-from hil.watch.look import Look, unpack_events
+from hil.watch.look import Look, figures, unpack_events
 from hil.watch.registry import WatchError, announced, ask_stop, choose, own_entry, runs, who_asked
-from hil.watch.terminal import sparkline
+from hil.watch.terminal import frame, sparkline
 
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(registry, "elsewhere", list)
     return tmp_path / "hil"
 
 
@@ -101,6 +106,77 @@ def test_a_stop_is_asked_once_and_says_who(own_folder: Path) -> None:
     finally:
         signal.signal(signal.SIGTERM, before)
     assert asked == [signal.SIGTERM]
+
+
+def test_a_run_of_another_environment_is_seen_and_stopped(
+    own_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a system unit's: it has no XDG_RUNTIME_DIR, its viewer has one."""
+    other, asked = tmp_path / f"hil-{os.getuid()}", list[int]()
+    monkeypatch.setattr(registry, "elsewhere", lambda: [other, tmp_path / "none", tmp_path / "open"])
+    (tmp_path / "open").mkdir(mode=0o755)
+    (tmp_path / "open" / "5.json").write_text("precious")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    before = signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
+    try:
+        with announced(entry()):
+            assert (other / f"{os.getpid()}.json").is_file()
+            monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+            assert runs() == [entry()] and choose("demo") == entry()
+            assert ask_stop(entry(), "me", 5, 6) and not ask_stop(entry(), "another", 7, 8)
+            monkeypatch.delenv("XDG_RUNTIME_DIR")
+            assert who_asked(os.getpid()) == (5, 6, "me")
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert asked == [signal.SIGTERM] and runs() == []
+    assert (tmp_path / "open" / "5.json").is_file(), "what others can write to is left alone"
+
+
+@pytest.fixture
+def ring() -> Iterator[Ring]:
+    made = [Ring.create(name, size, 64) for name, size in (("ticks", TICK.itemsize), ("events", EVENT_BYTES))]
+    yield made[0]
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def now(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The viewer's clock [ns], for the test to set."""
+    time_ns = [7_000_000_000]
+    monkeypatch.setattr("hil.clock.RealClock.now_ns", lambda _: time_ns[0])
+    return time_ns
+
+
+@pytest.mark.parametrize(("age_s", "silent"), [(0.0, False), (0.299, False), (0.301, True), (90.0, True)])
+def test_the_figures_of_a_loop_that_hangs_have_an_age(
+    ring: Ring, now: list[int], age_s: float, silent: bool
+) -> None:
+    ticks = new_ticks(20)
+    ticks["t_ns"] = now[0] - np.arange(20)[::-1] * 1_000_000
+    now[0] += round(age_s * 1e9)
+    for at in range(20):
+        ring.push(ticks[at : at + 1].tobytes())
+    look = Look(entry())
+    found = figures(look, look.latest(20))
+    assert found["silent"] == silent and found["age_s"] == age_s
+    assert found["rate_hz"] == (round(19 / (0.019 + age_s), 1) if silent else 1000.0)
+    shown = Console(width=100, record=True, file=io.StringIO())
+    shown.print(frame(look, 100))
+    text = shown.export_text()
+    assert (f"no tick for {age_s:.1f} s" in text) == silent and ("1000 Hz of 1000" in text) != silent
+    look.close()
+
+
+def test_in_lockstep_the_age_counts_from_what_the_viewer_saw(ring: Ring, now: list[int]) -> None:
+    look = Look(replace(entry(), clock="lockstep"))
+    for _ in range(2):
+        ring.push(new_ticks(1).tobytes())
+        assert look.age_s(look.latest(1)) == 0.0
+        now[0] += 400_000_000
+        assert look.age_s(look.latest(1)) == 0.4 and look.is_silent(0.4)
+    look.close()
 
 
 def test_a_process_without_rings_is_refused() -> None:

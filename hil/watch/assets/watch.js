@@ -59,6 +59,10 @@
   function show(now) {
     get("state").textContent = now.state.replaceAll("_", " ") + (now.reason ? ": " + now.reason.replaceAll("_", " ") : "");
     get("state").className = now.state === "operation_enabled" ? "good" : now.state.startsWith("fault") ? "bad" : "warn";
+    if (now.silent) {
+      get("state").textContent = `no tick for ${now.age_s.toFixed(1)} s: the loop hangs or is stopped`;
+      get("state").className = "bad";
+    }
     const late = now.lateness_us ?? {};
     const rows = {tick: now.k, speed: number(now.w, 2, "rad/s"), reference: number(now.w_ref, 2, "rad/s"),
       "load estimate": number(now.T_L_hat, 2, "N m"), "DC link": number(now.v_dc, 0, "V"),
@@ -89,7 +93,8 @@
     }
     if (message.status) idle(message.status);
     if (message.note) get("note").textContent = message.note;
-    if (message.curves) { show(message.now); list(message.events); take(message.curves); }
+    if (message.now) show(message.now);
+    if (message.curves) { list(message.events); take(message.curves); }
   }
 
   function idle(text) {
