@@ -501,6 +501,15 @@ class DriveClient:
                 return True
         return False
 
+    def other_master(self, seconds: float) -> int | None:
+        """Listen for SYNC and commands that only this client should send: the identifier heard, or None."""
+        end = time.monotonic_ns() + round(seconds * 1e9)
+        while (left := end - time.monotonic_ns()) > 0:
+            frame = self._link.receive(left)
+            if frame is not None and frame.can_id | frame.flags in self._foreign:
+                return frame.can_id
+        return None
+
     def saved(self) -> Saved:
         """What its frames have left in it, but for the tick; :meth:`restore` goes back there."""
         return Saved(self._state.tobytes(), self._last.tobytes())

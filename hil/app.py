@@ -28,6 +28,7 @@ from drivers.lockstep import LockstepLink
 from drivers.mapping import MEASURED, RECEIVED, DriveMap, house_map, map_from_table
 from drivers.watch import CommandWatch
 from hil import fused, realtime
+from hil.claim import ClaimedError, claimed
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, SlowMessage, WireFacts, build
@@ -49,6 +50,9 @@ from hil.watch.registry import announced, own_entry, who_asked
 
 MAX_LOAD = 0.7
 LOAD_REMEDY = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
+LISTEN_PERIODS, LISTEN_S = 5, 0.05
+"""How long a run listens for another controller: so many of its own periods, and at least that long."""
+ANOTHER_REMEDY = "stop it, take another bus.channel, or only look: loop.shadow, hil watch"
 EMULATED_INTERFACES = ("hil-local", "virtual")
 
 
@@ -343,10 +347,20 @@ def _client(
 
 
 def check_arming(setup: Setup, arm: bool) -> None:
-    """Refuse a real bus without an explicit ``--arm``; a shadow run sends nothing and needs none."""
-    if arm or setup.config.loop.shadow or is_emulated_bus(setup.config):
+    """Refuse a real bus without an explicit ``--arm``; a shadow run sends nothing and needs none.
+
+    Lockstep is refused there in any case: a real drive's time does not stand still.
+    """
+    bus, loop = setup.config.bus, setup.config.loop
+    if is_emulated_bus(setup.config):
         return
-    bus = setup.config.bus
+    if loop.clock == "lockstep":
+        raise ArmingError(
+            f"{bus.interface}:{bus.channel} may carry a real drive, which keeps its own time: nothing was "
+            'sent; leave --lockstep out, or set loop.clock = "realtime"'
+        )
+    if arm or loop.shadow:
+        return
     raise ArmingError(
         f"{bus.interface}:{bus.channel} may carry a real drive: nothing was sent; "
         "check with 'hil check', then arm with --arm"
@@ -406,8 +420,21 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
-    with _guarding(setup) as words:
+    with _alone(setup), _guarding(setup) as words:
         return _recorded(setup, request, path, clock, words)
+
+
+@contextlib.contextmanager
+def _alone(setup: Setup) -> Iterator[None]:
+    """No other process of this machine may send what this run sends. Raises ArmingError."""
+    binding, bus = setup.binding, setup.config.bus
+    sent = [bound.message for bound in binding.outgoing] + ([binding.sync] if binding.sync else [])
+    names = [] if setup.config.loop.shadow else [f"0x{message.send_id:X}" for message in sent]
+    try:
+        with claimed(bus.interface, bus.channel, names):
+            yield
+    except ClaimedError as error:
+        raise ArmingError(f"{error}; nothing was sent; {ANOTHER_REMEDY}") from error
 
 
 @contextlib.contextmanager
@@ -439,6 +466,8 @@ def _recorded(
         with opened_client(setup, recorder, clock, watch) as client:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             _await_drive(setup, client)
+            if not watch:
+                _hear_others(setup, client)
             recorder.await_open()
             say(f"{'listening only' if watch else 'arming'}; log {path}")
             drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
@@ -476,6 +505,17 @@ def _await_drive(setup: Setup, client: DriveClient) -> None:
         raise ArmingError(f"{odd}; correct the DBC, or the drive's mapping; nothing was sent")
 
 
+def _hear_others(setup: Setup, client: DriveClient) -> None:
+    """Listen for another controller, on this machine or not, before anything is sent. Raises ArmingError."""
+    heard = client.other_master(max(LISTEN_PERIODS * setup.config.loop.period_ns * 1e-9, LISTEN_S))
+    if heard is not None:
+        bus = setup.config.bus
+        raise ArmingError(
+            f"another controller sends 0x{heard:X} on {bus.interface}:{bus.channel}: nothing was sent; "
+            f"{ANOTHER_REMEDY}"
+        )
+
+
 def plan_of(config: RunConfig) -> Plan:
     """Timing of the run."""
     loop = config.loop
@@ -503,7 +543,9 @@ def _run_armed(
                 realtime.keep_off(recorder.writer_pid, setup.config.realtime.cpu)
                 grants = realtime.acquire(setup.config.realtime)
             bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
-            entry = own_entry(recorder.path, f"{bus.interface}:{bus.channel}", rate_hz, plan.ticks)
+            entry = own_entry(
+                recorder.path, f"{bus.interface}:{bus.channel}", rate_hz, plan.ticks, clock.name
+            )
             with announced(entry), watching(os.getpid(), plan.ticks):
                 begin_ns = time.thread_time_ns()
                 outcome = loop.run()
@@ -528,6 +570,9 @@ def _run_armed(
         if end is not None:
             result["end"] = end.as_dict()
         complete = recorder.close(result)
+        if not complete:
+            kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"
+            say(f"log {recorder.path} is not complete{kept}")
     processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
     return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us, end)
 

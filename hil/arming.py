@@ -38,9 +38,11 @@ def summary(config: RunConfig) -> str:
 
 
 def confirm(config: RunConfig, asking: TextIO, telling: TextIO) -> None:
-    """Ask a person on a terminal; anything but ``yes`` raises ArmingError. A pipe is not asked."""
+    """Ask a person on a terminal; anything but ``yes`` raises ArmingError, and so does no terminal."""
     if not asking.isatty():
-        return
+        raise ArmingError(
+            "not armed: standard input is no terminal to ask on; nothing was sent; --yes arms without asking"
+        )
     telling.write(summary(config) + "\ntype yes to arm: ")
     telling.flush()
     if asking.readline().strip().lower() != "yes":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import sys
 import threading
@@ -62,9 +63,10 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; every refusal is one clear line on standard error and exit code 2."""
+    _open_what_is_closed()
     args = _parser().parse_args(argv)
     try:
-        with _sigterm_unwinds():
+        with _signals_unwind():
             return int(args.run(args))
     except KeyboardInterrupt:
         say("hil: interrupted")
@@ -76,21 +78,42 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_REFUSED
 
 
+def _open_what_is_closed() -> None:
+    """Standard streams that were closed (2>&-) lead nowhere, and no bus or log gets their numbers."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.dup2(null := os.open(os.devnull, os.O_RDWR), number)
+            if null != number:
+                os.close(null)
+            os.set_inheritable(number, True)
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "r" if number == 0 else "w", closefd=False))  # noqa: SIM115
+
+
 @contextlib.contextmanager
-def _sigterm_unwinds() -> Iterator[None]:
-    """SIGTERM ends a command as an exception does, so that nothing half-written stays; a run has its own."""
+def _signals_unwind() -> Iterator[None]:
+    """SIGTERM and SIGHUP end a command as an exception does, so that nothing half-written and no process
+    stays; a run has its own. A SIGHUP that is ignored (nohup) stays so."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _terminate)
+    numbers = [number for number in (signal.SIGTERM, signal.SIGHUP) if _is_not_ignored(number)]
+    before = {number: signal.signal(number, _terminate) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler or signal.SIG_DFL)
 
 
-def _terminate(*_: object) -> NoReturn:
-    raise SystemExit(128 + signal.SIGTERM)
+def _is_not_ignored(number: int) -> bool:
+    return signal.getsignal(number) != signal.SIG_IGN
+
+
+def _terminate(number: int, _: object) -> NoReturn:
+    raise SystemExit(128 + number)
 
 
 def _words(error: Exception) -> str:

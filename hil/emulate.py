@@ -16,6 +16,7 @@ from firmware_model.faulty_plant import PlantFaults
 from firmware_model.node import Node, compile_kernels, frames_of, wire_of
 from hil import realtime
 from hil.app import Overrides, bus_settings, drive_map
+from hil.claim import claimed
 from hil.config import RunConfig, load_toml
 from hil.errors import ConfigError
 
@@ -94,7 +95,13 @@ def warm_up(path: Path, config: RunConfig) -> None:
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     """Run the emulator until SIGINT or SIGTERM. Prints one line when it listens and one at the end."""
     config = load_toml(path, RunConfig, overrides.as_settings())
-    node, link, what = make_node(path, config, plant_settings)
+    plant, _ = load_plant(path, config, plant_settings)
+    node_name, bus = f"node {plant.node_id}", config.bus
+    with claimed(bus.interface, bus.channel, [node_name]):
+        _serve(config, *make_node(path, config, plant_settings))
+
+
+def _serve(config: RunConfig, node: Node, link: Link, what: str) -> None:
     node.warm_up()
     if config.loop.clock == "realtime":
         below = config.realtime.model_copy(

@@ -1,4 +1,4 @@
-"""A robust mutex in shared memory: one process's thread holds it while it lives, another waits for it.
+"""Who ends when who ends: a robust mutex in shared memory that one process's thread holds while it lives.
 
 The kernel gives it up (EOWNERDEAD) as the thread ends, before the process's memory is torn down. A pidfd or
 the end of a pipe tells after that: with 500 MB locked, 20 to 40 ms later, and a drive's watchdog trips in 20.
@@ -9,14 +9,23 @@ from __future__ import annotations
 import ctypes
 import errno
 import os
+import signal
 from typing import Any, Final
 
 from hil.errors import HilError
 
 BYTES: Final = 64
 """Room for a pthread_mutex_t of every 64-bit Linux (40 on x86-64, 48 on arm64)."""
+PR_SET_PDEATHSIG: Final = 1
 CLOCK_MONOTONIC, PROCESS_SHARED, ROBUST = 1, 1, 1
 SECOND_NS: Final = 1_000_000_000
+
+
+def end_with(parent: int) -> None:
+    """From now on this process is killed when its parent ends, or the parent's thread that started it."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before
+        raise SystemExit(128 + signal.SIGKILL)
 
 
 class _Timespec(ctypes.Structure):

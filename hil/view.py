@@ -75,7 +75,7 @@ def demo_table(result: dict[str, Any]) -> Table:
             f"{g['what']}: {g['detail'] if g['granted'] else 'no, ' + g['detail']}" for g in result["grants"]
         )
         or "nothing asked (lockstep)",
-        "ended": result["ended"],
+        "ended": result["ended"] + (f" in lockstep: {result['too_slow']}" if result.get("too_slow") else ""),
         **end_rows(result["end"]),
         "replay": verdict_text(replay),
         "log": result["log"],

@@ -18,6 +18,7 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
     )
+    command.add_argument("--parent", type=int, help=argparse.SUPPRESS)  # end with this process
     bus_flags(command)
     command = commands.add(
         "simulate", cmd_simulate, "Run controller and emulated motor in one process without a bus."
@@ -43,6 +44,10 @@ def register(commands: Commands) -> None:
 
 def cmd_emulate(args: argparse.Namespace) -> int:
     """Serve the emulated drive until stopped."""
+    from hil.lifeline import end_with
+
+    if args.parent is not None:
+        end_with(args.parent)
     with lean_imports():
         from hil.emulate import serve
     serve(args.config, overrides(args), args.plant_set)
