@@ -145,6 +145,8 @@ def verdict(done: list[Stop], count: int) -> tuple[bool, str]:
 
     Without the right to lock memory or to FIFO the time is said, not judged; the drive's end always is.
     """
+    if not done:
+        return False, "first stop frame after SIGKILL: no run could be killed"
     times = sorted(stop.after_ms for stop in done)
     faults = sum("FAULT" in stop.drive for stop in done)
     granted = all(stop.fifo and stop.locked_mb > 0.0 for stop in done)

@@ -20,7 +20,7 @@ from drivers.codec import Database
 from hil.app import Overrides
 from hil.demo import emulator_process
 from hil.errors import HilError
-from hil.guardian import STOPS, GuardedDrive, Rights, Word, guardian, guardian_flags
+from hil.guardian import GUARDIAN_LOST_NS, STOPS, GuardedDrive, Rights, Word, guardian, guardian_flags
 from hil.log.reader import open_log
 from hil.signals import DriveState, Reason, RxFlag, new_ticks
 from tests.conftest import CONFIGS
@@ -28,6 +28,7 @@ from tests.conftest import CONFIGS
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
 HOUSE = Database(CONFIGS / "drives" / "hil_pmsm.dbc")
+WATCHDOG_OFF = ("firmware.watchdog_ms=0.0",)
 COMMAND, FEEDBACK = HOUSE.message("COMMAND"), HOUSE.message("FEEDBACK")
 
 
@@ -91,10 +92,8 @@ def alive(pid: int) -> bool:
 def bench(configs: Path, settings: Settings, channel: str, tmp_path: Path) -> Iterator[Bench]:
     own = settings("loop.duration_s=60.0", "reference.down_at_s=59.0", "guardian.timeout_ms=80.0")
     path = configs / "demo.toml"
-    plant = configs / "plants" / "demo.toml"
-    plant.write_text(plant.read_text().replace("watchdog_ms = 400.0", "watchdog_ms = 0.0"))
     words = [word for setting in own for word in ("--set", setting)]
-    with emulator_process(path, Overrides(settings=own)), listener(channel) as bus:
+    with emulator_process(path, Overrides(settings=own), WATCHDOG_OFF), listener(channel) as bus:
         run = subprocess.Popen(
             [sys.executable, "-m", "hil.cli", "run", str(path), *words],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -159,9 +158,13 @@ def test_a_stopped_controller_never_sends_again(bench: Bench) -> None:
 
 def test_without_its_guardian_a_run_ends(bench: Bench) -> None:
     os.kill(bench.guardian_pid, signal.SIGKILL)
+    killed_ns = time.monotonic_ns()
     assert bench.run.wait(20) == 1
     ticks = bench.log().ticks
     assert Reason(int(ticks["reason"][-1])) == Reason.GUARDIAN_LOST
+    seen = ticks[ticks["reason"] != 0][0]
+    after_ns = int(seen["t_ns"]) - killed_ns  # its last beat was up to a timeout before
+    assert GUARDIAN_LOST_NS - 90_000_000 < after_ns < GUARDIAN_LOST_NS + int(seen["gap"]) * 1_000_000
     assert float(abs(ticks["u_q"][-1])) == 0.0
 
 

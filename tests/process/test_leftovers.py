@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import signal
 import subprocess
@@ -12,7 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.process.test_run import flags
+from hil.app import Overrides
+from hil.demo import emulator_process
+from hil.log.reader import open_log
+from hil.signals import Request
+from tests.process.test_run import call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
@@ -57,6 +62,40 @@ def test_a_demo_that_is_ended_leaves_no_emulator(
     finally:
         demo.kill()
         demo.wait()
+
+
+def test_a_signal_is_heard_however_long_a_tick_waits(
+    configs: Path, settings: Settings, tmp_path: Path
+) -> None:
+    """The longest feedback timeout that is allowed, and a drive that no longer answers."""
+    path = configs / "demo.toml"
+    more = ("loop.feedback_timeout_us=64000", "feedback.hold_ticks=900", "loop.duration_s=60.0")
+    own = settings(*more)
+    with emulator_process(path, Overrides(settings=own)) as drive, hil("run", str(path), *flags(own)) as run:
+        wait_for_log(tmp_path)
+        os.kill(drive, signal.SIGSTOP)
+        time.sleep(0.1)
+        asked_ns = time.monotonic_ns()
+        run.send_signal(signal.SIGINT)
+        run.communicate(timeout=30)
+        os.kill(drive, signal.SIGCONT)
+    ticks = open_log(only_log(tmp_path)).ticks
+    heard = ticks[ticks["request"] >= Request.STOP][0]
+    assert int(heard["t_ns"]) - asked_ns < 200_000_000
+
+
+def test_a_feedback_timeout_longer_than_any_tick_is_refused(configs: Path, settings: Settings) -> None:
+    for value in ("1000000000000", "1e300", "100001"):
+        done = call("run", str(configs / "demo.toml"), *flags(settings(f"loop.feedback_timeout_us={value}")))
+        assert done.returncode == 2 and "feedback_timeout_us" in done.stderr, done.stderr
+        assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("value", ["1e300", "1e-9", "-1.0", "nan", "20000.0"])
+def test_a_guardian_that_could_not_watch_is_refused(configs: Path, settings: Settings, value: str) -> None:
+    done = call("run", str(configs / "demo.toml"), *flags(settings(f"guardian.timeout_ms={value}")))
+    assert done.returncode == 2 and "guardian.timeout_ms" in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr and "waiting" not in done.stderr
 
 
 @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&-", "<&- >&- 2>&-"])

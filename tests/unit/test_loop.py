@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from drivers.errors import EncodeError
 from hil.clock import FakeClock, LockstepClock, RealClock
 from hil.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
@@ -119,14 +120,30 @@ def test_a_little_late_is_run_and_not_skipped() -> None:
     assert int(memory.ticks[1]["gap"][0]) == 1
 
 
-@pytest.mark.parametrize("where", ["receive"])
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+@pytest.mark.parametrize("where", ["sync", "receive", "send"])
+@pytest.mark.parametrize("error", [EncodeError, RuntimeError, KeyboardInterrupt, SystemExit])
 def test_every_exception_ends_with_a_stopped_drive(where: str, error: type[Exception]) -> None:
+    """In the same tick: the next thing that is asked of the drive is the stop, and nothing after it."""
     drive = ScriptedDrive({where: 3}, error)
-    loop, _, _ = make(drive, FakeClock())
+    loop, memory, _ = make(drive, FakeClock())
     with pytest.raises(error):
         loop.run()
-    assert drive.calls[-1] == "stop"
+    assert drive.calls[-2:] == [where, "stop"] and drive.calls.count(where) == 3
+    assert len(memory.ticks) == 2, "what was not sent is not logged as a tick"
+
+
+@pytest.mark.parametrize("where", ["tick", "event"])
+def test_a_recorder_that_raises_ends_with_a_stopped_drive(where: str) -> None:
+    drive = ScriptedDrive()
+    loop, memory, _ = make(drive, FakeClock())
+
+    def broken(*_: object) -> None:
+        raise RuntimeError(where)
+
+    setattr(memory, where, broken)
+    with pytest.raises(RuntimeError, match=where):
+        loop.run()
+    assert drive.calls[-2:] == ["send", "stop"]
 
 
 def test_an_exception_in_the_law_ends_with_a_stopped_drive() -> None:
