@@ -44,7 +44,7 @@ JUDGES = {
 }
 """The tests of tests/unit that judge the mutants of a file."""
 FILES = tuple(JUDGES)
-PROCESSES = ("_serve", "guardian", "_await_ready", "START_S")
+PROCESSES = ("_serve", "guardian", "_await_ready", "_await_end", "Rights.acquire", "START_S", "END_S")
 """What forks, and the fork: tests/process/test_guardian.py tests that with processes, too slow for this."""
 EQUIVALENT = Path(__file__).with_name("equivalent.txt")
 BROKEN = 70
