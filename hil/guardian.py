@@ -85,7 +85,7 @@ class Words:
     def __init__(self) -> None:
         memory = memoryview(mmap.mmap(-1, mmap.PAGESIZE))
         self.lifeline = Lifeline(memory[-BYTES:])
-        self.cells: Any = memory[:-BYTES].cast("q")
+        self.cells: Any = memory.cast("q")
 
 
 class GuardedDrive:
