@@ -434,7 +434,7 @@ def _alone(setup: Setup) -> Iterator[None]:
         with claimed(bus.interface, bus.channel, names):
             yield
     except ClaimedError as error:
-        raise ArmingError(f"{error}; nothing was sent; {ANOTHER_REMEDY}") from error
+        raise ArmingError(f"nothing was sent: {error}; to look on: hil watch, --shadow") from error
 
 
 @contextlib.contextmanager

@@ -39,7 +39,9 @@ def _hold(bus: str, name: str) -> socket.socket:
         holder.listen()
     except OSError as error:
         holder.close()
-        raise ClaimedError(f"{_who(address)} sends {name} on {bus} already") from error
+        raise ClaimedError(
+            f"{_who(address)} sends {name} on {bus} already: stop that, or take another bus.channel"
+        ) from error
     return holder
 
 
