@@ -145,6 +145,8 @@ class Recording:
     def _check_times(self, stamps: np.ndarray) -> None:
         """Note the steps of the stamps and what goes back. Raises LogError for a clock that was set back."""
         steps = np.diff(stamps)
+        if len(stamps) >= FEW and not steps.any():
+            raise LogError(f"{self.path}: its {len(stamps)} stamps are all the same: its clock stands still")
         self.step_ns = int(np.gcd.reduce(steps)) if len(stamps) >= FEW else 0
         if len(steps):
             self.longest = int(steps.max()), int(stamps[steps.argmax()]) - self.start_ns

@@ -9,6 +9,7 @@ from drivers.codec import Database
 from drivers.errors import DriverError
 from firmware_model.config import PlantConfig
 from hil.config import RunConfig, load_toml
+from hil.convert.recording import Recording
 from hil.errors import HilError
 from hil.faults.matrix import Matrix
 from hil.log.info import info
@@ -40,6 +41,12 @@ def read_log(path: Path) -> None:
     out = path.with_suffix(".out")
     out.unlink(missing_ok=True)
     recover(path, out)
+
+
+def read_recording(path: Path) -> None:
+    """A recording of another tool, as far as it can be read."""
+    found = Recording(path, partial=True)
+    assert sum(1 for _ in found.frames()) == found.count
 
 
 def read_config(path: Path) -> None:

@@ -16,7 +16,11 @@ import tempfile
 import warnings
 from pathlib import Path
 
-NAMES = ("config", "plant", "faults", "dbc", "log", "codec", "client", "guard", "tick")
+NAMES = (
+    *("config", "plant", "faults", "dbc", "log"),
+    *("rec-log", "rec-asc", "rec-trc", "rec-blf", "rec-mf4"),
+    *("codec", "client", "guard", "tick"),
+)
 
 
 def run_target(name: str, work: Path, seconds: int, seed: int) -> None:

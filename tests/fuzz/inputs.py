@@ -19,11 +19,22 @@ from pathlib import Path
 from hil.config import load_toml
 from hil.faults.matrix import Matrix
 from tests.fuzz import client, codec, guard
-from tests.fuzz.files import Take, read_config, read_database, read_log, read_matrix, read_plant, reads
+from tests.fuzz.files import (
+    Take,
+    read_config,
+    read_database,
+    read_log,
+    read_matrix,
+    read_plant,
+    read_recording,
+    reads,
+)
 from tests.fuzz.tick import whole_tick
 from tests.logfiles import some_frames, some_ticks, write_log
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CORPUS = Path(__file__).resolve().parents[1] / "corpus"
+RECORDINGS = ("log", "asc", "trc", "blf", "mf4")
 LONGEST = 600
 WORDS = (b"-1", b"0", b"1e400", b"nan", b"9" * 20, b"[", b'"', b"\x00", b"../../x", b"\xff\xfe", b"{}")
 
@@ -67,6 +78,11 @@ def shipped(*names: str) -> tuple[bytes, ...]:
     return tuple((CONFIGS / name).read_bytes() for name in names)
 
 
+def recorded(kind: str) -> tuple[bytes, ...]:
+    """The corpus's recordings of one format."""
+    return tuple(path.read_bytes() for path in sorted(CORPUS.glob(f"*.{kind}")))
+
+
 def targets(work: Path) -> dict[str, Target]:
     """Return every target by name; ``work`` is a folder for the files that are read."""
     log = work / "seed.mcap"
@@ -82,6 +98,10 @@ def targets(work: Path) -> dict[str, Target]:
             reads(work / "drive.dbc", read_database), shipped("drives/hil_pmsm.dbc", "drives/inverter_fd.dbc")
         ),
         "log": Target(reads(work / "run.mcap", read_log), (log.read_bytes(),)),
+        **{
+            f"rec-{kind}": Target(reads(work / f"rec.{kind}", read_recording), recorded(kind))
+            for kind in RECORDINGS
+        },
         "codec": Target(codec.take),
         "client": Target(client.take),
         "guard": Target(guard.take),

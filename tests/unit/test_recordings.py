@@ -162,6 +162,26 @@ def test_a_line_of_asc(tmp_path: Path, body: str) -> None:
     assert found == ([] if wanted is None else [(start_ns + 500_000_000, "0", *wanted)]) + [last]
 
 
+def test_an_asc_file_without_its_end_says_so(tmp_path: Path) -> None:
+    found = recording(tmp_path / "a.asc", f"{ASC_HEAD}Begin Triggerblock x\n 0.1 1 181 Rx d 1 11\n")
+    assert found.count == 1 and any("may be cut off" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    "last", [f"{STAMP} can0 181#22", f"{STAMP} can0 181#1122 ", f"{STAMP} can0 1", f"{STAMP} can0 181#112"]
+)
+def test_a_last_line_that_is_cut_off_is_no_shorter_frame(tmp_path: Path, last: str) -> None:
+    directed = " R" if last.endswith(" ") else ""
+    with pytest.raises(LogError, match=r"1 of 2 lines can't be read \(line 2: "):
+        recording(tmp_path / "a.log", f"{STAMP} can0 181#1122{directed}\n{last}")
+    assert recording(tmp_path / "a.log", f"{STAMP} can0 181#1122\n{STAMP} can0 181#3344").count == 2
+
+
+def test_a_clock_that_stands_still_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match="its 100 stamps are all the same"):
+        recording(tmp_path / "a.log", f"{STAMP} can0 181#11\n" * 100)
+
+
 def test_asc_in_decimal_and_with_relative_times() -> None:
     """Distances run over every line with a time, of whatever kind."""
     from hil.convert.readers import asc
@@ -190,8 +210,10 @@ def test_asc_in_decimal_and_with_relative_times() -> None:
         (f"{ASC_HEAD} 0.1 1 FFF Rx d 1 11\n", "FFF is no 11-bit identifier"),
         (f"{ASC_HEAD} 0.1 1 181 Rx d 1 1FF\n", "are no bytes"),
         (f"{ASC_HEAD} 0.1 CANFD 1 Rx 181 1 0 9 12 11\n", "of 12 bytes are there"),
-        (f"{ASC_HEAD}Begin Triggerblock x\n 0.1 1 181 Rx d 1 11\n", "ends before its End TriggerBlock"),
-        (f"{ASC_HEAD} 0.1 1 181 Rx d 1 11\n 0.2 1 18", "ends before its End TriggerBlock"),
+        (
+            f"{ASC_HEAD} 0.1 1 181 Rx d 1 11\n 0.2 1 18",
+            "in the middle of a line",
+        ),
         (" 0.1 1 181 Rx d 1 11\n", "not an ASC file"),
         ("", "has no frames"),
     ],

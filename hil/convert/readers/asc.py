@@ -74,8 +74,10 @@ class Reader:
                     yield from self._take(text)
                 except UnreadableError as error:
                     self._found.lose(f"line {number}", error)
-        if not self._closed and (self._opened or not line.endswith("\n")):
-            self._found.cut = "the file ends before its End TriggerBlock"
+        if not self._closed and not line.endswith("\n"):
+            self._found.cut = "the file ends in the middle of a line, before its End TriggerBlock"
+        elif self._opened and not self._closed:
+            self._found.notes["Begin TriggerBlock without its end: the file may be cut off"] += 1
 
     def _take(self, text: str) -> Iterator[Recorded]:
         stamped = _STAMPED.match(text)

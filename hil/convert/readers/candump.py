@@ -38,7 +38,7 @@ OTHERS: Final = (
 
 def read(lines: Iterable[str], found: Found) -> Iterator[Recorded]:
     """Frames of the lines. Raises NotThisFormatError when it is something else."""
-    directed = False
+    directed, sizes = False, dict[int, int]()
     for number, line in enumerate(lines, start=1):
         text = line.strip()
         if not text or text.startswith("#"):
@@ -48,12 +48,14 @@ def read(lines: Iterable[str], found: Found) -> Iterator[Recorded]:
             _check(text)
         try:
             one, direction = _frame(text, found)
-            if directed and not (direction or line.endswith("\n") or one.can_id & ERROR):
+            if not line.endswith("\n") and (
+                (directed and not direction) or len(one.data) < sizes.get(one.can_id, 0)
+            ):
                 raise UnreadableError("the last line is cut off")
         except UnreadableError as error:
             found.lose(f"line {number}", error)
             continue
-        directed = directed or direction
+        directed, sizes[one.can_id] = directed or direction, len(one.data)
         yield one
 
 
