@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterable
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import can
 import numpy as np
@@ -174,6 +174,8 @@ class Blf(_Recording):
         self._writer.stop()
 
 
+MOST_APART: Final = 400
+"""Frames of the same us whose order MF4 keeps; more would read as the next us."""
 _GROUPS: Final = ("CAN_DataFrame", "CAN_RemoteFrame", "CAN_ErrorFrame")
 _FIELDS: Final = (
     ("BusChannel", "u1"), ("ID", "<u4"), ("IDE", "u1"), ("DLC", "u1"), ("DataLength", "u1"),
@@ -210,13 +212,12 @@ class Mf4Recording(_Recording):
     def add(self, frames: Records) -> None:
         """Append frames, each to its group."""
         first_ns = self._first_ns = int(frames["t_ns"][0]) if self._first_ns is None else self._first_ns
-        can_id = frames["can_id"]
+        seconds, can_id = _seconds(frames["t_ns"] - first_ns), frames["can_id"]
         kind = np.where(can_id & ERROR, 2, np.where(can_id & REMOTE, 1, 0))
         for index, group in enumerate(_GROUPS):
-            own = frames[kind == index]
-            if len(own):
-                seconds = (own["t_ns"] - first_ns) // 1000 * 1e-6
-                self._file.extend(index, [(seconds, None), (_group_rows(group, own), None)])
+            own = kind == index
+            if own.any():
+                self._file.extend(index, [(seconds[own], None), (_group_rows(group, frames[own]), None)])
 
     def close(self, *, whole: bool) -> None:
         """Write the file, when it is whole; let go of the temporary one."""
@@ -225,6 +226,15 @@ class Mf4Recording(_Recording):
                 self._file.save(self._path, overwrite=True)
         finally:
             self._file.close()
+
+
+def _seconds(t_ns: Any) -> Any:
+    """Times in us as seconds; frames of the same us are 1 ns apart: a file of groups has no other order."""
+    t_us = t_ns // 1000
+    places = np.arange(len(t_us))
+    new = np.append(True, t_us[1:] != t_us[:-1])
+    since = places - np.maximum.accumulate(np.where(new, places, 0))
+    return t_us * 1e-6 + np.minimum(since, MOST_APART) * 1e-9
 
 
 def _group_rows(group: str, frames: Records) -> Records:

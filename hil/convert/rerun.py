@@ -18,7 +18,7 @@ from hil.convert.periods import MOST_NS, Grid, Heard, Period, Roles, around
 from hil.convert.readers.recorded import ID_MASK
 from hil.loop import COUNTER_JUMP, ENDED, missed
 from hil.shadow import ShadowDrive
-from hil.signals import Request, RxFlag, new_ticks
+from hil.signals import ALL_MISSING, Request, RxFlag, new_ticks
 
 FAR_NS: Final = 2**62
 """A deadline that does not come: a wait ends with feedback or with the period's frames."""
@@ -194,7 +194,7 @@ class Run:
 
     def _read(self, reading: Reading, period: Period, ahead: list[int]) -> list[int]:
         """Read what the loop has read; return the gaps that the tick may have, the likeliest first."""
-        self._tick["rx_flags"] = 0
+        self._tick["rx_flags"], self._tick["missing"] = 0, ALL_MISSING
         frames = [*self._left, *period.late, *period.answers]
         late, read, self._left = (
             frames[: reading.sync],

@@ -47,7 +47,7 @@ def read(file: IO[bytes], found: Found) -> Iterator[Recorded]:
         groups = [_group(mdf, *which, start_ns, found) for which in _found_groups(mdf)]
         if not groups:
             raise NotThisFormatError("holds no frames: it has no group CAN_DataFrame (a file of signals?)")
-        yield from heapq.merge(*groups, key=lambda one: one.t_ns)
+        yield from (one for _, one in heapq.merge(*groups, key=lambda pair: pair[0]))
     finally:
         mdf.close()
 
@@ -78,8 +78,8 @@ def _found_groups(mdf: Any) -> list[tuple[int, str]]:
     ]
 
 
-def _group(mdf: Any, index: int, name: str, start_ns: int, found: Found) -> Iterator[Recorded]:
-    """Frames of one group; what of it can't be read is counted by its header."""
+def _group(mdf: Any, index: int, name: str, start_ns: int, found: Found) -> Iterator[tuple[float, Recorded]]:
+    """Frames of one group with their exact times [s]; what of it can't be read is counted by its header."""
     count = int(mdf.groups[index].channel_group.cycles_nr)
     for at in range(0, count, SLAB):
         take = min(SLAB, count - at)
@@ -92,7 +92,7 @@ def _group(mdf: Any, index: int, name: str, start_ns: int, found: Found) -> Iter
         found.places += len(rows)
         for row in range(len(rows)):
             try:
-                yield rows.frame(row, start_ns)
+                yield rows.seconds(row), rows.frame(row, start_ns)
             except UnreadableError as error:
                 found.lose(f"frame {at + row + 1} of {name}", error)
         if len(rows) < take:
@@ -124,12 +124,16 @@ class _Rows:
     def __len__(self) -> int:
         return len(self._times)
 
+    def seconds(self, row: int) -> float:
+        """Time from the file's start [s]."""
+        return float(self._times[row])
+
     def frame(self, row: int, start_ns: int) -> Recorded:
         """One record. Raises UnreadableError."""
         remote, error = self._kind == "CAN_RemoteFrame", self._kind == "CAN_ErrorFrame"
         number = int(self._id[row]) & ID_MASK
         can_id = identifier(number, extended=bool(self._extended[row]), remote=remote, error=error)
-        t_ns = start_ns + stamp_ns(float(self._times[row]))
+        t_ns = start_ns + stamp_ns(self.seconds(row))
         if remote:
             return frame(t_ns, self._name(row), can_id, not self._sent[row], False, self._asked(row))
         return frame(t_ns, self._name(row), can_id, not self._sent[row], self._is_fd(row), self._bytes(row))
