@@ -408,6 +408,12 @@ def _cascade() -> Any:
     return adapter.validate_python({"kind": "cascade"})
 
 
+class FaultsTable(Table):
+    """What `hil faults` expects of this configuration: by row, in place of what the shipped matrix does."""
+
+    expect: dict[str, dict[str, Any]] = Field(default_factory=dict)
+
+
 class RunConfig(Table):
     """Everything a run needs."""
 
@@ -425,6 +431,7 @@ class RunConfig(Table):
     log: LogTable = LogTable()
     criteria: CriteriaTable = CriteriaTable()
     emulator: EmulatorTable | None = None
+    faults: FaultsTable = FaultsTable()
 
 
 def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> Model:
@@ -520,7 +527,7 @@ def _given(value: Any) -> str:
 def _written(loc: tuple[Any, ...]) -> list[str]:
     """The key path as the file has it: pydantic names the kind of a law or an observer after its table."""
     kinds: dict[Any, Any] = {"controller": laws(), "speed": observers(), "current": observers()}
-    before = ("", *loc[:-1])
+    before = ("", *loc)[: len(loc)]
     return [str(part) for table, part in zip(before, loc, strict=True) if part not in kinds.get(table, ())]
 
 

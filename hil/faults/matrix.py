@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hil.config import Finite, Positive, Table, load_toml, read_toml
+from hil.config import Finite, Positive, RunConfig, Table, load_toml, read_toml, validate
 from hil.errors import ConfigError
 from hil.signals import Reason
 
@@ -170,12 +170,31 @@ def inline(value: Any) -> str:
 def load_matrix(path: Path, shipped: Path) -> tuple[Matrix, Path]:
     """The matrix that ``path`` names and its run configuration.
 
-    ``path`` may be a matrix, or a run configuration that the shipped matrix is then run with.
+    ``path`` may be a matrix, or a run configuration that the shipped matrix is then run with, judged by what
+    the configuration's own table ``[faults.expect]`` says of its rows.
     """
-    if "row" in read_toml(path):
+    data = read_toml(path)
+    if "row" in data:
         matrix = load_toml(path, Matrix)
         return matrix, path.parent / matrix.run
-    return load_toml(shipped, Matrix), path
+    given = load_toml(path, RunConfig).faults.expect
+    return _expecting(load_toml(shipped, Matrix), given, path), path
+
+
+def _expecting(matrix: Matrix, given: dict[str, dict[str, Any]], path: Path) -> Matrix:
+    """The matrix with other expectations of some rows. Raises ConfigError with all mistakes."""
+    rows = {row.name: row for row in matrix.row}
+    problems = [f"faults.expect: there is no row {name!r}" for name in given if name not in rows]
+    for name, table in given.items():
+        try:
+            rows[name] = rows[name].model_copy(update={"expect": validate(table, Expect, name, path.parent)})
+        except ConfigError as error:
+            problems += [f"faults.expect: {name}: {problem}" for problem in error.problems]
+        except KeyError:
+            continue
+    if problems:
+        raise ConfigError(str(path), problems)
+    return matrix.model_copy(update={"row": list(rows.values())})
 
 
 def chosen(matrix: Matrix, names: list[str]) -> list[Row]:

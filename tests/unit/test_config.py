@@ -155,3 +155,12 @@ def test_no_number_of_a_plant_is_beyond_every_range(configs: Path, text: str) ->
 )
 def test_ranges_of_times(configs: Path, override: str, said: str) -> None:
     assert said in problems(configs / "demo.toml", override)
+
+
+def test_a_mistake_of_a_whole_file_has_no_key(configs: Path) -> None:
+    loads = "load=" + repr([{"kind": "constant", "torque_n_m": 1.0}] * 8).replace(
+        "'kind':", "kind ="
+    ).replace("'torque_n_m':", "torque_n_m =")
+    extra = "fault=[{kind='load', at_s=0.5, torque_n_m=1.0}]"
+    with pytest.raises(ConfigError, match="more than 8 loads with those of the faults"):
+        load_toml(configs / "plants/demo.toml", PlantConfig, [loads, extra])
