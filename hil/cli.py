@@ -24,6 +24,7 @@ from hil.commands import (
     replay,
     report,
     run,
+    tuning,
     watch,
 )
 from hil.commands.common import EXIT_REFUSED, Commands, say
@@ -46,9 +47,26 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil bench [CONFIG]           cost of a tick, rate and lateness on this machine
   hil faults [CONFIG]          every fault against the running loop, with a verdict on each
   hil campaign PLAN            thousands of cases over all cores: yield, what matters, worst
+  hil compare CONFIG           laws tuned by one optimiser to the same limits, side by side
+  hil design CONFIG            windows and poles for a motor, its noise and a wish
   hil paper                    everything the paper prints and draws, recomputed
 """
-MODULES = (demo, run, watch, emulated, replay, report, log, convert, play, paper, bench, faults, campaign)
+MODULES = (
+    demo,
+    run,
+    watch,
+    emulated,
+    replay,
+    report,
+    log,
+    convert,
+    play,
+    paper,
+    bench,
+    faults,
+    campaign,
+    tuning,
+)
 
 
 def _parser() -> argparse.ArgumentParser:

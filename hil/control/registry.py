@@ -42,6 +42,12 @@ class Key:
     """Most entries of ``numbers``."""
 
 
+def complete(given: Values, member: Observer | Law) -> dict[str, Any]:
+    """The values that a design takes: what is given, without ``kind``, and the defaults of the rest."""
+    defaults = {name: key.default for name, key in member.keys.items() if key.default is not REQUIRED}
+    return defaults | {name: value for name, value in given.items() if name != "kind"}
+
+
 @dataclass(frozen=True, slots=True)
 class Channel:
     """What an observer's design is told: the channel (0 w, 1 q, 2 d), T_s [s], the joint sampled model."""

@@ -1,0 +1,127 @@
+"""The bench of a configuration: believed motor, load step, and the noise that its drive and frames have."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hil.app import Overrides, Setup, load_setup
+from hil.control.law import FAC
+from hil.design import motor_model
+from hil.emulate import load_plant
+from hil.errors import HilError
+from hil.metrics import RECOVERED_RAD_S, find_step, operating
+from hil.signals import Reason, TickArray
+from hil.simulate import simulate_ticks
+from hil.tuning.measure import Bench
+
+QUIET_S: Final = 0.5
+"""Time before the load step in which the noise of u_q is measured."""
+
+
+def speed_drive(path: Path, overrides: Overrides) -> Setup:
+    """The setup of a drive under speed control. Raises HilError for a law that commands the load."""
+    setup = load_setup(path, overrides)
+    if int(setup.machine.law["kind"][0]) == FAC:
+        raise HilError(f"{path}: controller.kind fac commands the load; only speed drives can be tuned")
+    return setup
+
+
+def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = None, **more: Any) -> Bench:
+    """The bench of a config; ``given`` replaces load [N m], w_noise [rad/s], i_noise [A] of the plant's file.
+
+    The resolution of frames and modulator counts as noise of q / sqrt(12). Raises HilError.
+    """
+    sensors, load, u_lsb = (0.0, 0.0), None, 0.0
+    if setup.config.emulator is not None:
+        plant, _ = load_plant(path, setup.config)
+        sensors = plant.sensors.w_noise_rad_s, plant.sensors.i_noise_a
+        steps = [abs(one.torque_n_m) for one in plant.load if one.kind == "step"]
+        load, u_lsb = max(steps, default=None), plant.inverter.resolution_v
+    own = {name: value for name, value in (given or {}).items() if value is not None}
+    motor, lsb = motor_model(setup.config.motor), setup.wire.x_lsb
+    load = own.get("load", load)
+    if load is None:
+        load = 0.1 * motor.k_t * setup.config.limits.i_max_a
+    return Bench(
+        motor,
+        1.0 / setup.config.loop.rate_hz,
+        load,
+        math.hypot(own.get("w_noise", sensors[0]), lsb[0] / math.sqrt(12)),
+        math.hypot(own.get("i_noise", sensors[1]), lsb[1] / math.sqrt(12)),
+        max(u_lsb, setup.wire.u_lsb) / math.sqrt(12),
+        _speed(setup),
+        **more,
+    )
+
+
+def _speed(setup: Setup) -> float:
+    """The speed that the reference goes to [rad/s]."""
+    reference = setup.config.reference
+    if reference.kind == "table":
+        return float(reference.w_rad_s[-1])
+    return abs(reference.offset_rad_s if reference.kind == "sine" else reference.w_rad_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A load step in a simulated run: dip [rad/s], recovery [ms], IAE [rad]; noise of u_q before it [V]."""
+
+    dip: float
+    recovery_ms: float
+    iae: float
+    u_noise: float
+    ended: str
+
+
+def seen_in(ticks: TickArray, T_s: float) -> Seen:
+    """Judge a run with a load step. Raises HilError when it has none."""
+    row = find_step(operating(ticks))
+    own = operating(ticks)
+    ended = Reason(int(ticks["reason"][-1])).name.lower()
+    if ended != "stop_requested":
+        return Seen(math.inf, math.inf, math.inf, math.inf, ended)
+    if row is None:
+        raise HilError("the plant's file has no load step of 0.5 N m and more; laws are compared by one")
+    error = own["w"] - own["w_ref"]
+    after = error[row : row + _settled(own, row)]
+    outside = np.nonzero(np.abs(after) > RECOVERED_RAD_S)[0]
+    recovery = (int(outside[-1]) + 1) * T_s * 1e3 if len(outside) else 0.0
+    quiet = own["u_q_law"][max(0, row - round(QUIET_S / T_s)) : row]
+    line = np.polyval(np.polyfit(np.arange(len(quiet)), quiet, 1), np.arange(len(quiet)))
+    return Seen(
+        float(np.abs(after).max()),
+        recovery,
+        float(np.abs(after).sum() * T_s),
+        float(np.std(quiet - line)),
+        ended,
+    )
+
+
+def _settled(own: TickArray, row: int) -> int:
+    """Ticks after the step until load or reference change again, at most 0.4 s."""
+    load = np.abs(np.diff(own["T_L_true"][row:])) > 0.5
+    moving = np.abs(own["dw_ref"][row + 1 :]) > 0
+    changed = np.nonzero(load | moving)[0]
+    period_s = float(np.median(np.diff(own["t_ns"]))) * 1e-9
+    return min(round(0.4 / period_s), int(changed[0]) + 1 if len(changed) else len(own) - row)
+
+
+def corner_settings(bench: Bench) -> list[list[str]]:
+    """The corners of the spread as settings of the plant's file."""
+    out = []
+    for m in bench.corners():
+        motor = {"R_s_ohm": m.R_s, "L_d_h": m.L_d, "L_q_h": m.L_q, "psi_f_wb": m.psi_f, "n_p": m.n_p}
+        motor |= {"J_kg_m2": m.J, "B_f_n_m_s": m.B_f}
+        out.append(["motor={" + ", ".join(f"{name} = {value!r}" for name, value in motor.items()) + "}"])
+    return out
+
+
+def simulated(path: Path, overrides: Overrides, plant: list[str]) -> Seen:
+    """One run in `hil simulate`."""
+    setup = load_setup(path, overrides)
+    return seen_in(simulate_ticks(setup, plant), 1.0 / setup.config.loop.rate_hz)

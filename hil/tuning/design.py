@@ -1,0 +1,168 @@
+"""`hil design`: from motor, rate, noise, spread and a wish to windows and poles, with what they will do.
+
+The wish is a set of limits: noise in u_q, Ms, dip, recovery. With a dip or a recovery wished for, noise is
+made least; else the worst corner's IAE is. The front is the same design at other budgets of noise. A soft
+shaft makes the design slower until it is stable on it, or it is refused.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from hil.app import Overrides
+from hil.control.law import LawSpec
+from hil.design import law_spec
+from hil.errors import HilError
+from hil.tuning.bench import bench_of, speed_drive
+from hil.tuning.families import Family, family, toml
+from hil.tuning.loop import rigid, shaft
+from hil.tuning.measure import Bench, margins, quiet
+from hil.tuning.optimise import Limits, Tuned, law_of, spec_of, tune
+from hil.tuning.windows import figures
+
+WINDOWS: Final = ("ftdob", "least-noise", "cubic")
+"""What is tried when no law is named."""
+BUDGETS: Final = (0.25, 0.5, 2.0, 4.0)
+"""Noise in u_q of the front's other points, times that of the design."""
+CHECKED_HZ: Final = 24
+SEARCHED_HZ: Final = 8
+CHECK_S: Final = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What is wished for; ``shaft_hz`` is one resonance or a range (low, high)."""
+
+    u_noise_mv: float | None = None
+    ms: float = 1.6
+    ms_worst: float = 2.2
+    dip: float | None = None
+    recovery_ms: float | None = None
+    shaft_hz: tuple[float, float] | None = None
+    shaft_damping: float = 0.01
+    shaft_share: float = 0.5
+    laws: tuple[str, ...] = WINDOWS
+    effort: float = 0.5
+
+    @property
+    def aims_at_noise(self) -> bool:
+        """Whether noise is to be least, not IAE."""
+        return self.dip is not None or self.recovery_ms is not None
+
+    def limits(self, share: float = 1.0) -> Limits:
+        """Of the search; 100 mV where nothing else bounds the noise."""
+        u_mv = self.u_noise_mv
+        if u_mv is None:
+            u_mv = math.inf if self.aims_at_noise else 100.0
+        dip, recovery = (math.inf if wish is None else wish for wish in (self.dip, self.recovery_ms))
+        return Limits(u_mv * 1e-3 * share, self.ms, self.ms_worst, dip, recovery)
+
+    def shafts(self, count: int) -> tuple[tuple[float, float, float], ...]:
+        """The resonances to look at."""
+        if self.shaft_hz is None:
+            return ()
+        low, high = self.shaft_hz
+        hz = [low] if low == high else np.geomspace(low, high, count).tolist()
+        return tuple((f, self.shaft_damping, self.shaft_share) for f in hz)
+
+
+def _tune(
+    one: Family, bench: Bench, limits: Limits, base: LawSpec, effort: float, aim: Any, start: Any
+) -> Tuned:
+    return tune(one, bench, limits, base, effort=effort, aim=aim, start=start)
+
+
+def _best(found: Sequence[Tuned], noise: bool) -> Tuned:
+    """The best that keeps all limits. Raises HilError when none does."""
+    kept = [one for one in found if one.feasible]
+    if not kept:
+        raise HilError(f"no design keeps these limits; {_why(found)}")
+    return min(kept, key=lambda one: one.verdict.u_noise if noise else one.verdict.worst.iae)
+
+
+def _why(found: Sequence[Tuned]) -> str:
+    """How near the nearest came."""
+    if not any(one.verdict.worst.stable for one in found):
+        return (
+            "every design tried is unstable in a corner or on the shaft: narrow the spread, stiffen the shaft"
+        )
+    near = min(found, key=lambda one: one.verdict.worst.ms)
+    v = near.verdict
+    return (
+        f"{near.family.law} came to {v.u_noise * 1e3:.1f} mV, Ms {v.nominal.ms:.2f}/{v.worst.ms:.2f}, dip "
+        f"{v.nominal.dip:.2f} rad/s, back in {v.nominal.recovery_ms:.0f} ms: loosen one of them"
+    )
+
+
+def design(
+    path: Path, overrides: Overrides, wish: Wish, given: dict[str, float | None], spread: dict[str, float]
+) -> tuple[dict[str, Any], Tuned]:
+    """Find the design and its front. Raises HilError when none keeps the limits."""
+    start = time.perf_counter()
+    setup = speed_drive(path, overrides)
+    base = law_spec(setup.config)
+    bench = bench_of(path, setup, given, spread=spread, shafts=wish.shafts(SEARCHED_HZ))
+    aim = "noise" if wish.aims_at_noise else "iae"
+    limits, families = wish.limits(), [family(name) for name in wish.laws]
+    with ProcessPoolExecutor() as pool:
+        jobs = [pool.submit(_tune, f, bench, limits, base, wish.effort, aim, None) for f in families]
+        best = _best([job.result() for job in jobs], wish.aims_at_noise)
+        _check_shafts(best, bench, base, wish)
+        at = best.verdict.u_noise if wish.aims_at_noise else limits.u_noise
+        budgets = [
+            replace(limits, u_noise=at * share, dip=math.inf, recovery_ms=math.inf) for share in BUDGETS
+        ]
+        jobs = [pool.submit(_tune, best.family, bench, b, base, wish.effort, "iae", best.x) for b in budgets]
+        front = [best, *(job.result() for job in jobs)]
+    spec = spec_of(best.tables, base)
+    found = _result(best, front, spec, bench, np.array(setup.wire.x_lsb))
+    found |= {"config": str(path), "wish": asdict(wish), "seconds": time.perf_counter() - start}
+    return found, best
+
+
+def _check_shafts(best: Tuned, bench: Bench, base: LawSpec, wish: Wish) -> None:
+    """Refuse what is unstable on the shaft, on a finer grid and for longer than the search looked."""
+    fine = wish.shafts(CHECKED_HZ)
+    plants = [shaft(bench.motor, bench.T_s, *one) for one in fine]
+    law = law_of(best.tables, base, bench.T_s)
+    bad = [one[0] for one, calm in zip(fine, quiet(law, bench, plants, CHECK_S), strict=True) if not calm]
+    if bad:
+        raise HilError(
+            f"unstable on a shaft with resonance at {', '.join(f'{hz:.0f}' for hz in bad)} Hz: "
+            "wish for less (--u-noise-mv, --ms), stiffen or damp the shaft"
+        )
+
+
+def _front(found: Sequence[Tuned]) -> list[Tuned]:
+    """By noise; a point that buys nothing with its noise is left out."""
+    kept: list[Tuned] = []
+    for one in sorted((one for one in found if one.feasible), key=lambda one: one.verdict.u_noise):
+        if not kept or one.verdict.worst.iae < kept[-1].verdict.worst.iae * 0.995:
+            kept.append(one)
+    return kept
+
+
+def _result(best: Tuned, front: Sequence[Tuned], spec: LawSpec, bench: Bench, lsb: Any) -> dict[str, Any]:
+    """The JSON form of a design."""
+    law, verdict = law_of(best.tables, spec, bench.T_s), best.verdict
+    points = _front(front)
+    return {
+        "law": best.family.law,
+        "tables": best.tables,
+        "poles": {key: value for key, value in best.tables["controller"].items() if key != "kind"},
+        "windows": figures(spec, bench, lsb),
+        **verdict.as_dict(),
+        "margins": margins(law, bench, rigid(bench.motor, bench.T_s)),
+        "limited_by": list(best.limits_it),
+        "bench": asdict(bench),
+        "front": [{"toml": toml(one.tables), **one.verdict.as_dict()} for one in points],
+        "toml": toml(best.tables),
+    }

@@ -1,0 +1,101 @@
+"""The linear closed loop that laws are tuned on: the very kernels of the tick against exact sampled plants.
+
+About i_d = 0, without limits and rounding, one tick late. A law is a record of LAW_PARAMS, so whatever is
+registered can be tuned; nothing of it is written down twice. `hil simulate` is the judge of what comes out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+
+from hil.control.jit import jit
+from hil.control.law import MotorModel, apply, command, observe, reset
+from hil.control.linalg import Array
+
+Record = npt.NDArray[np.void]
+LOAD, PULSE_W, PULSE_I, PULSE_U = range(4)
+"""What disturbs the loop: a unit step of the load, a unit pulse on a measurement or on the voltage."""
+QUIET: Final = 3
+"""Ticks at rest before it: the observer's memory is filled by then."""
+NO_LIMIT: Final = 1e300
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    """x+ = A x + b u + e T_L with x = (w, i_q, ...): A (n, n), b and e (n,)."""
+
+    A: Array
+    b: Array
+    e: Array
+
+
+def _sampled(A: Array, B: Array, T_s: float) -> Plant:
+    """Exact for u and T_L held over a tick; B (n, 2)."""
+    n = len(A)
+    whole = np.zeros((n + 2, n + 2))
+    whole[:n, :n], whole[:n, n:] = A, B
+    step = expm(whole * T_s)
+    return Plant(*(np.ascontiguousarray(part) for part in (step[:n, :n], step[:n, n], step[:n, n + 1])))
+
+
+def rigid(motor: MotorModel, T_s: float) -> Plant:
+    """Motor and load as one inertia."""
+    return _sampled(motor.A()[:2, :2], np.array([[0.0, -1 / motor.J], [1 / motor.L_q, 0.0]]), T_s)
+
+
+def shaft(motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share: float = 0.5) -> Plant:
+    """Two inertias on an elastic shaft: resonance [Hz], its damping, the motor's share of J.
+
+    x = (w, i_q, torsion, w_load); k = w_r^2 J_m J_l / J, c = 2 damping k / w_r.
+    """
+    J_m, J_l, w_r = motor.J * share, motor.J * (1 - share), 2 * np.pi * hz
+    k = w_r**2 * J_m * J_l / motor.J
+    c = 2 * damping * k / w_r
+    A = np.zeros((4, 4))
+    A[0] = -(c + motor.B_f) / J_m, motor.k_t / J_m, -k / J_m, c / J_m
+    A[1, :2] = motor.A()[1, :2]
+    A[2] = 1, 0, 0, -1
+    A[3] = c / J_l, 0, k / J_l, -c / J_l
+    return _sampled(A, np.array([[0.0, 0.0], [1 / motor.L_q, 0.0], [0.0, 0.0], [0.0, -1 / J_l]]), T_s)
+
+
+@jit
+def respond(p: Any, s: Any, A: Array, b: Array, e: Array, kind: int, out: Array) -> None:
+    """The loop's response from rest; ``out`` (4, K): command, voltage, w, i_q from the disturbance on."""
+    n, K = A.shape[0], out.shape[1]
+    x, new = np.zeros(n), np.zeros(n)
+    reset(s)
+    apply(s, 0.0, 0.0, 0.0)
+    u = 0.0
+    for k in range(-QUIET, K):
+        ua = u
+        w = x[0] + (1.0 if kind == PULSE_W and k == 0 else 0.0)
+        i_q = x[1] + (1.0 if kind == PULSE_I and k == 0 else 0.0)
+        observe(p, s, w, i_q, 0.0, True, 1)
+        apply(s, 0.0, ua, 0.0)
+        command(p, s, 0.0, 0.0, 0.0, NO_LIMIT)
+        u = s["u"][1]
+        given = ua + (1.0 if kind == PULSE_U and k == 0 else 0.0)
+        load = 1.0 if kind == LOAD and k >= 0 else 0.0
+        if k >= 0:
+            out[0, k], out[1, k], out[2, k], out[3, k] = u, given, x[0], x[1]
+        for r in range(n):
+            total = b[r] * given + e[r] * load
+            for c in range(n):
+                total += A[r, c] * x[c]
+            new[r] = total
+        for r in range(n):
+            x[r] = new[r]
+
+
+@jit
+def respond_all(p: Any, s: Any, A: Array, b: Array, e: Array, kinds: Any, out: Array) -> None:
+    """:func:`respond` for every plant and kind; A (m, n, n), out (m, kinds, 4, K)."""
+    for m in range(A.shape[0]):
+        for j in range(kinds.shape[0]):
+            respond(p, s, A[m], b[m], e[m], kinds[j], out[m, j])

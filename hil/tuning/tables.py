@@ -1,0 +1,55 @@
+"""Tables of a comparison and of a design for the terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from hil.tuning.page import COLUMNS, cell
+from hil.view import key_values
+
+
+def comparison_table(found: dict[str, Any]) -> Table:
+    """One row a law, the configuration itself first."""
+    limits = found["limits"]
+    title = (
+        f"hil compare {found['config']}: u_q {limits['u_noise_mv']:.1f} mV, "
+        f"Ms {limits['ms']:.2f}/{limits['ms_worst']:.2f}"
+    )
+    table = Table(title=title, title_justify="left")
+    for name, (text, _) in COLUMNS.items():
+        table.add_column(text, justify="left" if name == "law" else "right")
+    for row in (found["as_configured"], *found["rows"]):
+        table.add_row(*(cell(row, name) for name in COLUMNS))
+    return table
+
+
+def design_table(found: dict[str, Any]) -> Table:
+    """What a design is and does."""
+    rows: dict[str, Any] = {"law": found["law"]}
+    rows |= {key: f"{value:g} rad/s" for key, value in found["poles"].items() if key.endswith("pole_rad_s")}
+    for name, w in found["windows"].items():
+        rows[f"{name} window"] = (
+            f"N = {w['N']} (D = {w['D_ms']:g} ms), sigma_d {w['sigma_d']:.3g}, one LSB up to "
+            f"{w['lsb_bound']:.3g}, lag {w['lag_ms']:.1f} ms, peak |H| {w['peak_H']:.2f}"
+        )
+    margins = found["margins"]
+    rows |= {
+        "dip, nominal / worst corner": f"{found['dip']:.2f} / {found['worst_dip']:.2f} rad/s",
+        "back in 0.5 rad/s": f"{found['recovery_ms']:.0f} / {found['worst_recovery_ms']:.0f} ms",
+        "IAE": f"{found['iae']:.3f} / {found['worst_iae']:.3f} rad",
+        "noise": f"u_q {found['u_noise_mv']:.1f} mV, w {found['w_noise_mrad_s']:.2f} mrad/s",
+        "Ms": f"{found['ms']:.2f} / {found['ms_worst']:.2f}",
+        "margins": f"gain {margins['gain']:.1f}, phase {margins['phase_deg']:.0f} deg, "
+        f"delay {margins['delay_ms']:.1f} ms",
+        "limited by": ", ".join(found["limited_by"]) or "nothing that was wished for",
+    }
+    if verified := found.get("verified"):
+        rows["verified"] = (
+            f"{'as predicted' if verified['ok'] else 'NOT as predicted'}: dips within "
+            f"{verified['worst_dip_off']:.1%}, noise {verified['noise_off']:+.1%}, bus "
+            f"{'same to the bit' if verified['bus_same'] else 'differs'}"
+        )
+    rows |= {"written": found["written"], "front": found["picture"], "took": f"{found['seconds']:.1f} s"}
+    return key_values("hil design", rows)

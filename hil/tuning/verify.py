@@ -1,0 +1,82 @@
+"""`hil design --verify`: the design in `hil simulate` and on the lockstep bus, over 18 plants."""
+
+from __future__ import annotations
+
+import os
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from hil.app import Overrides, load_setup, run
+from hil.demo import emulator_process
+from hil.log.reader import open_log
+from hil.simulate import simulate_ticks
+from hil.tuning.bench import bench_of, corner_settings, seen_in
+from hil.tuning.families import Tables, settings_of
+from hil.tuning.loop import Record
+from hil.tuning.measure import loops, noise
+
+DIP_WITHIN: Final = 0.05
+NOISE_WITHIN: Final = 0.15
+
+
+def plants_of(bench: Any) -> dict[str, list[str]]:
+    """The plant of the config's file, the believed motor, and every corner of the spread."""
+    believed = corner_settings(replace(bench, spread={"J": 0.0, "psi_f": 0.0, "R_s": 0.0, "L": 0.0}))
+    corners = corner_settings(bench)
+    m = bench.motor
+    exact = (
+        f"motor={{R_s_ohm = {m.R_s!r}, L_d_h = {m.L_d!r}, L_q_h = {m.L_q!r}, psi_f_wb = {m.psi_f!r}, "
+        f"n_p = {m.n_p}, J_kg_m2 = {m.J!r}, B_f_n_m_s = {m.B_f!r}}}"
+    )
+    named = {"as in the plant's file": [], "as believed": believed[0] if believed else [exact]}
+    return named | {f"corner {j + 1}": one for j, one in enumerate(corners)}
+
+
+def on_the_bus(path: Path, overrides: Overrides, plant: list[str]) -> Any:
+    """The ticks of a lockstep run with the emulator as a process."""
+    channel = f"verify-{os.getpid()}-{uuid.uuid4().hex[:6]}"
+    overrides = replace(overrides, channel=channel, settings=(*overrides.settings, 'loop.clock="lockstep"'))
+    with emulator_process(path, overrides, tuple(plant)):
+        result = run(load_setup(path, overrides))
+    return open_log(Path(result.log)).ticks
+
+
+def verify(
+    path: Path, overrides: Overrides, tables: Tables, given: dict[str, Any], spread: dict[str, float],
+    law: Record, seen: Callable[[int], None],
+) -> dict[str, Any]:  # fmt: skip
+    """Run the design everywhere; ``ok`` when every dip and the noise are as predicted and the bus agrees."""
+    overrides = replace(overrides, settings=(*overrides.settings, *settings_of(tables)))
+    setup = load_setup(path, overrides)
+    bench = bench_of(path, setup, given, spread=spread)
+    said = dict(zip(list(plants_of(bench))[1:], loops(law, bench, bench.plants()), strict=True))
+    rows: list[dict[str, Any]] = []
+    for name, plant in plants_of(bench).items():
+        ticks = simulate_ticks(setup, plant)
+        own, bus = seen_in(ticks, bench.T_s), on_the_bus(path, overrides, plant)
+        row = {"plant": name, "dip": own.dip, "recovery_ms": own.recovery_ms, "iae": own.iae}
+        row |= {"u_noise_mv": own.u_noise * 1e3, "bus_same": same_run(ticks, bus)}
+        if name in said:
+            row |= {"predicted_dip": said[name].dip, "dip_off": own.dip / said[name].dip - 1}
+        rows.append(row)
+        seen(len(rows))
+    u = noise(law, bench, bench.plants()[0])[0]
+    off = rows[1]["u_noise_mv"] / (u * 1e3) - 1
+    dips = max(abs(row["dip_off"]) for row in rows if "dip_off" in row)
+    same = all(row["bus_same"] for row in rows)
+    return {
+        "rows": rows,
+        "worst_dip_off": dips,
+        "noise_off": off,
+        "bus_same": same,
+        "ok": dips <= DIP_WITHIN and abs(off) <= NOISE_WITHIN and same,
+    }
+
+
+def same_run(ticks: Any, bus: Any) -> bool:
+    """Whether speed and voltage of both are the same to the bit for as long as both ran."""
+    count = min(len(ticks), len(bus))
+    return count > 0 and all((ticks[name][:count] == bus[name][:count]).all() for name in ("w", "u_q", "u_d"))

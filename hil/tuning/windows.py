@@ -1,0 +1,41 @@
+"""What the windows of a design reach: length, noise, bound of the resolution, lag, peak of |H|."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hil.control.law import LawSpec, law_window, sampled_model
+from hil.control.linalg import Array
+from hil.control.observer import bounds, impulse_response, response_length
+from hil.tuning.measure import Bench
+
+
+def figures(spec: LawSpec, bench: Bench, lsb: Array) -> dict[str, dict[str, float]]:
+    """Of the speed and the current channel; ``mismatch_allowed`` is 1 / peak |H| (small gain), the share by
+    which k_t / J may be off while any loop around the estimate stays stable."""
+    window, model = law_window(spec, bench.T_s), sampled_model(spec.motor, bench.T_s)
+    weights = impulse_response(window, response_length(window))
+    limits = bounds(window, model.Ad, model.Ed, bench.T_s, lsb)
+    noises = np.array([bench.w_noise, bench.i_noise, bench.i_noise])
+    return {
+        name: _channel(weights[:, c], model, bench, noises, c) | {"lsb_bound": float(limits.resolution[c])}
+        for c, name in enumerate(("speed", "current"))
+    }
+
+
+def _channel(g: Array, model: Any, bench: Bench, noises: Array, c: int) -> dict[str, float]:
+    """Figures of one channel's weights."""
+    inverse = model.gap_inverse[0]
+    rows = np.r_[g, 0.0][:, None] * inverse[c] - np.r_[0.0, g][:, None] * (inverse @ model.Ad)[c]
+    peak = float(np.abs(np.fft.rfft(g, max(4096, len(g)))).max())
+    N = int(np.nonzero(np.abs(g) > 1e-12)[0][-1]) + 1
+    return {
+        "N": N,
+        "D_ms": N * bench.T_s * 1e3,
+        "sigma_d": float(np.sqrt(((rows * noises) ** 2).sum())),
+        "lag_ms": float((g * (np.arange(len(g)) + 0.5)).sum() * bench.T_s * 1e3),
+        "peak_H": peak,
+        "mismatch_allowed": 1.0 / peak,
+    }

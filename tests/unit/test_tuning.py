@@ -1,0 +1,211 @@
+"""The linear loop, the optimiser and the windows' figures, against an independent program's."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.app import Overrides, load_setup
+from hil.cli import main
+from hil.control.law import design_law
+from hil.design import law_spec
+from hil.errors import HilError
+from hil.simulate import simulate_ticks
+from hil.tuning.bench import bench_of, seen_in
+from hil.tuning.compare import parse_laws
+from hil.tuning.families import FAMILIES, family, settings_of, toml
+from hil.tuning.loop import rigid, shaft
+from hil.tuning.measure import Bench, judge, loops, margins, quiet
+from hil.tuning.optimise import Limits, law_of, spec_of, tune
+from hil.tuning.windows import figures
+from tests.conftest import CONFIGS
+
+DEMO = CONFIGS / "demo.toml"
+OLD = (
+    'controller={kind="cascade", speed_pole_rad_s=30.0, current_pole_rad_s=250.0}',
+    'observer.speed={kind="ftdob", gamma_1_rad_s=25.0, gamma_2_rad_s=58.0, delay_ms=12.0}',
+    'observer.current={kind="ftdob", gamma_1_rad_s=30.0, gamma_2_rad_s=70.0, delay_ms=10.0}',
+)
+SETUP = load_setup(DEMO, Overrides(settings=OLD))
+SPEC = law_spec(SETUP.config)
+BENCH = replace(bench_of(DEMO, SETUP), u_noise=0.0, w_0=0.0)
+FAST = {
+    "controller": {"kind": "cascade", "speed_pole_rad_s": 105.0, "current_pole_rad_s": 480.0},
+    "speed": {"kind": "ftdob", "gamma_1_rad_s": 37.5, "gamma_2_rad_s": 87.5, "delay_ms": 8.0},
+    "current": {"kind": "ftdob", "gamma_1_rad_s": 20.0, "gamma_2_rad_s": 46.7, "delay_ms": 15.0},
+}
+
+
+def test_the_linear_loop_of_the_first_demo() -> None:
+    """Figures of an independent program, which shares no code with this one."""
+    law = design_law(SPEC, 1e-3)
+    found = judge(law, BENCH)
+    for loop, wanted in ((found.nominal, (3.82, 78, 0.163, 1.36)), (found.worst, (6.81, 86, 0.299, 1.62))):
+        assert (loop.dip, loop.recovery_ms, loop.iae, loop.ms) == pytest.approx(wanted, rel=4e-3)
+    assert found.u_noise == pytest.approx(0.023, abs=1e-4)
+    own = margins(law, BENCH, rigid(BENCH.motor, 1e-3))
+    assert (own["gain"], own["phase_deg"], own["delay_ms"]) == pytest.approx((4.3, 70.0, 4.4), rel=0.01)
+
+
+def test_the_linear_loop_foretells_the_simulation() -> None:
+    ticks = simulate_ticks(SETUP, ["motor={" + motor_text() + "}"])
+    seen, said = seen_in(ticks, 1e-3), judge(design_law(SPEC, 1e-3), bench_of(DEMO, SETUP))
+    assert seen.dip == pytest.approx(said.nominal.dip, rel=0.03)
+    assert seen.iae == pytest.approx(said.nominal.iae, rel=0.06)
+    assert seen.u_noise == pytest.approx(said.u_noise, rel=0.15)
+
+
+def motor_text() -> str:
+    m = BENCH.motor
+    return (
+        f"R_s_ohm={m.R_s}, L_d_h={m.L_d}, L_q_h={m.L_q}, psi_f_wb={m.psi_f}, n_p={m.n_p}, "
+        f"J_kg_m2={m.J}, B_f_n_m_s={m.B_f}"
+    )
+
+
+def test_an_unstable_loop_has_no_finite_measure() -> None:
+    wild = json.loads(json.dumps(FAST))
+    wild["controller"]["speed_pole_rad_s"] = 900.0
+    found = judge(law_of(wild, SPEC, 1e-3), BENCH)
+    assert math.isinf(found.worst.ms) and math.isinf(found.worst.dip) and not found.worst.stable
+
+
+def test_a_soft_shaft_upsets_the_fast_tuning_and_not_the_slow_one() -> None:
+    hz = (15, 40, 80, 160, 300, 400)
+    plants = [shaft(BENCH.motor, 1e-3, f) for f in hz]
+    assert all(quiet(design_law(SPEC, 1e-3), BENCH, plants, 4.0))
+    calm = dict(zip(hz, quiet(law_of(FAST, SPEC, 1e-3), BENCH, plants, 4.0), strict=True))
+    assert not any(calm[f] for f in (80, 160, 300)) and calm[15]
+
+
+def test_a_stiff_shaft_is_a_rigid_one() -> None:
+    law, stiff = design_law(SPEC, 1e-3), shaft(BENCH.motor, 1e-3, 5000.0, 0.3)
+    one, other = (loops(law, BENCH, [plant])[0] for plant in (rigid(BENCH.motor, 1e-3), stiff))
+    assert other.dip == pytest.approx(one.dip, rel=0.01)
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_every_family_makes_configs_that_design(name: str) -> None:
+    one, rng = FAMILIES[name], np.random.default_rng(3)
+    for _ in range(5):
+        x = [float(np.exp(rng.uniform(math.log(low), math.log(high)))) for low, high in one.free]
+        tables = one.tables(x, BENCH)
+        setup = load_setup(DEMO, Overrides(settings=settings_of(tables)))
+        by_config = design_law(law_spec(setup.config), 1e-3)
+        assert by_config.tobytes() == law_of(tables, SPEC, 1e-3).tobytes(), (
+            "config and optimiser mean the same"
+        )
+        assert "np." not in toml(tables)
+
+
+def test_tuning_keeps_the_limits_and_is_better_than_what_it_began_with() -> None:
+    limits = Limits(0.0235, 1.37, 1.63)
+    found = tune(family("cubic"), BENCH, limits, SPEC, effort=0.25)
+    v = found.verdict
+    assert found.feasible and v.worst.stable
+    assert v.u_noise <= 0.0235 * 1.005 and v.nominal.ms <= 1.37 * 1.005 and v.worst.ms <= 1.63 * 1.005
+    assert v.worst.iae < 0.75 * 0.299 and v.nominal.iae < 0.55 * 0.163
+    assert found.limits_it
+    again = tune(family("cubic"), BENCH, limits, SPEC, effort=0.25)
+    assert again.tables == found.tables, "seeded"
+    tight = tune(family("cubic"), BENCH, Limits(1e-4, 1.01, 1.01), SPEC, effort=0.1)
+    assert not tight.feasible
+
+
+def test_figures_of_windows() -> None:
+    spec = spec_of(FAST | {"speed": {"kind": "least-noise", "delay_ms": 12.0}}, SPEC)
+    found = figures(spec, replace(BENCH, i_noise=0.0), np.array([0.01, 0.001, 0.001]))["speed"]
+    sigma = BENCH.w_noise / 1e-3 * math.sqrt(12 / (12 * 13 * 14))
+    assert found["sigma_d"] == pytest.approx(sigma, rel=0.01)
+    assert (found["N"], found["lag_ms"]) == (12, pytest.approx(6.0, rel=1e-6))
+    assert found["peak_H"] == pytest.approx(1.0, rel=1e-9)
+    ramp = spec_of(FAST | {"speed": {"kind": "ramp-exact", "delay_ms": 24.0}}, SPEC)
+    assert figures(ramp, BENCH, np.full(3, 0.01))["speed"]["peak_H"] == pytest.approx(1.6, abs=0.05)
+
+
+def test_the_spread_has_its_corners() -> None:
+    assert len(BENCH.corners()) == 16
+    only = replace(BENCH, spread={"J": 0.5, "psi_f": 0.0, "R_s": 0.0, "L": 0.0})
+    assert [m.J / BENCH.motor.J for m in only.corners()] == pytest.approx([0.5, 1.5])
+    assert replace(BENCH, spread=dict.fromkeys(BENCH.spread, 0.0)).corners() == []
+
+
+@pytest.mark.parametrize("text", ["", "pid", "pi,pi", "pi,nothing", ",", "kalman,lqg"])
+def test_laws_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(HilError, match="--laws"):
+        parse_laws(text)
+
+
+def test_compare_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flags = ["--laws", "pi,cubic", "--effort", "0.12", "--seeds", "2", "-o", str(tmp_path), "--json"]
+    wide = ["--u-noise-mv", "60", "--ms", "1.8", "--ms-worst", "2.6"]
+    assert main(["compare", str(DEMO), *flags, *wide]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [row["law"] for row in found["rows"]] == ["pi", "cubic"]
+    for row in found["rows"]:
+        assert set(row) >= {"law", "dip", "recovery_ms", "iae", "u_noise_mv", "ms", "ms_worst", "worst_dip"}
+        assert 1.0 < row["dip"] < row["worst_dip"] < 8.0 and 10 < row["recovery_ms"] < 120
+        assert row["linear"]["u_noise_mv"] <= 60.5 and row["ms"] <= 1.81 and row["ms_worst"] <= 2.62
+    assert len(found["seeds"]) == 2
+    page = (tmp_path / "compare.html").read_text()
+    assert "cubic" in page and "data:image/svg+xml" in page and "[observer.speed]" in page
+
+
+def test_design_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "tuned.toml"
+    args = ["design", str(DEMO), "--law", "cubic", "--effort", "0.2", "-o", str(out), "--json"]
+    assert main([*args, "--u-noise-mv", "40"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["u_noise_mv"] <= 40.3 and found["ms"] <= 1.61 and found["worst_dip"] < 6.0
+    assert (tmp_path / "tuned.png").read_bytes().startswith(b"\x89PNG")
+    noises = [point["u_noise_mv"] for point in found["front"]]
+    assert noises == sorted(noises) and len(noises) >= 2
+    tables = load_setup(DEMO, Overrides(settings=settings_of(found["tables"])))
+    assert judge(tables.machine.law, bench_of(DEMO, tables)).nominal.dip == pytest.approx(found["dip"])
+    assert out.read_text() == found["toml"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--u-noise-mv", "0.01"], "no design keeps these limits"),
+        (["--law", "none"], "no law 'none'"),
+        (["--spread", "K=0.1"], "no parameter 'K'"),
+        (["-o", "/nowhere/x.toml"], "no such folder"),
+    ],
+)
+def test_designs_that_can_not_be_are_refused(
+    flags: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if "-o" in flags else ["-o", str(tmp_path / "x.toml")]
+    law = [] if "--law" in flags else ["--law", "cubic"]
+    assert main(["design", str(DEMO), "--effort", "0.05", *law, *out, *flags]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "x.toml").exists()
+
+
+def test_fac_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["compare", str(CONFIGS / "paper.toml"), "--laws", "pi", "-o", str(tmp_path)]) == 2
+    assert "only speed drives" in capsys.readouterr().err
+
+
+def bench(**more: Any) -> Bench:
+    return replace(BENCH, **more)
+
+
+def test_a_shaft_makes_the_design_slower() -> None:
+    hz = (40.0, 120.0, 300.0)
+    plants = [shaft(BENCH.motor, 1e-3, f) for f in hz]
+    assert not all(quiet(law_of(FAST, SPEC, 1e-3), BENCH, plants)), (
+        "a design for these limits without a shaft"
+    )
+    shafts = tuple((f, 0.01, 0.5) for f in hz)
+    soft = tune(family("ftdob"), bench(shafts=shafts), Limits(0.11, 1.6, 2.3), SPEC, effort=0.2)
+    assert soft.feasible and all(quiet(law_of(soft.tables, SPEC, 1e-3), BENCH, plants, 4.0))
+    assert soft.verdict.nominal.dip > judge(law_of(FAST, SPEC, 1e-3), BENCH).nominal.dip
