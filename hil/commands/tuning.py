@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import time
 from pathlib import Path
 from typing import Any
 
@@ -201,7 +202,9 @@ def cmd_design(args: argparse.Namespace) -> int:
         args.shaft_share, laws, args.effort,
     )  # fmt: skip
     given = {"load": args.load, "w_noise": args.w_noise, "i_noise": args.i_noise}
+    start = time.perf_counter()
     found, best = design(args.config, overrides(args), wish, given, _spread(args.spread))
+    found["seconds"] = time.perf_counter() - start
     picture = path.with_suffix(".png")
     front_picture(found, picture)
     path.write_text(found["toml"], encoding="utf-8")
