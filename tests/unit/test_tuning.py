@@ -178,6 +178,8 @@ def test_design_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         (["--law", "none"], "no law 'none'"),
         (["--spread", "K=0.1"], "no parameter 'K'"),
         (["-o", "/nowhere/x.toml"], "no such folder"),
+        (["-o", "x.txt"], "must end in .toml"),
+        (["-o", str(DEMO)], "is the configuration itself"),
     ],
 )
 def test_designs_that_can_not_be_are_refused(
