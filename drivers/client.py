@@ -14,10 +14,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Any, Final, NoReturn
 
 import numpy as np
-import numpy.typing as npt
 
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
@@ -37,7 +36,7 @@ from drivers.frames import (
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
 from drivers.mapping import DriveMap, house_map
-from drivers.port import SocketPort
+from drivers.port import Compiled, Saved, SocketPort
 from drivers.posix import (
     COMMANDED,
     DRAIN_MOST,
@@ -71,25 +70,6 @@ _MISSING_AT: Final = (STATE.names or ()).index("missing_at")
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
 _SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
-
-
-class Saved(NamedTuple):
-    """What the frames so far have left in a client: record of the kernels, last counters, own fields."""
-
-    state: bytes
-    counters: bytes
-
-
-class Compiled(NamedTuple):
-    """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
-
-    ``exchange`` and ``command`` are places, ``sync_bytes`` the size of SYNC's frame, ``log`` the frames.
-    """
-
-    exchange: npt.NDArray[np.int64]
-    command: npt.NDArray[np.int64]
-    sync_bytes: int
-    log: npt.NDArray[np.void]
 
 
 def _offset(tick: Any, name: str) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,25 @@ from drivers.wire import STATE
 
 Arrays = dict[str, Any]
 """What :data:`drivers.posix.ARRAYS` names."""
+
+
+class Saved(NamedTuple):
+    """What the frames so far have left in a client: record of the kernels, last counters, own fields."""
+
+    state: bytes
+    counters: bytes
+
+
+class Compiled(NamedTuple):
+    """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
+
+    ``exchange`` and ``command`` are places, ``sync_bytes`` the size of SYNC's frame, ``log`` the frames.
+    """
+
+    exchange: npt.NDArray[np.int64]
+    command: npt.NDArray[np.int64]
+    sync_bytes: int
+    log: npt.NDArray[np.void]
 
 
 class SocketPort:

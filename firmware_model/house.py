@@ -11,6 +11,7 @@ import numpy as np
 
 from drivers.bus import Frame
 from drivers.codec import Database, Message
+from drivers.errors import DatabaseError
 from firmware_model.config import Wire
 from firmware_model.kernels import Kernels
 
@@ -46,6 +47,7 @@ class HouseFrames:
         self.answers += [(self.status, SLOW)] if self.status else []
         self.answers += [(database.message("FEEDBACK", *measured), measured)]
         """What is sent after a SYNC, FEEDBACK last, and the fields of the sample in it."""
+        self._check_counters()
         self.counters = np.array([-1, -1, *(0 for _ in self.answers)], np.int64)
         self._counters: Any = self.counters.data
         self._emergency_id = database.message("EMCY").can_id
@@ -58,6 +60,16 @@ class HouseFrames:
         self.inline_load = "LoadTorque" in command.signals
         self._read_inline = command.reader("LoadEnable", "LoadTorque") if self.inline_load else None
         self.ignored: Counter[str] = Counter()
+
+    def _check_counters(self) -> None:
+        """It counts from 0, whatever the DBC would allow a real drive. Raises DatabaseError."""
+        for message in (self.command, self.load_command, *(message for message, _ in self.answers)):
+            counter = message.signals.get("Counter") if message else None
+            if message and counter and counter.raw_range()[0] != 0:
+                raise DatabaseError(
+                    f"{message.name}.Counter begins with {counter.raw_range()[0]} by the DBC; the emulated "
+                    "drive counts from 0: give it a DBC of its own in its plant's file"
+                )
 
     @property
     def spoken(self) -> dict[int, int]:

@@ -10,8 +10,9 @@ import numpy as np
 
 from drivers.binding import Binding
 from drivers.bus import Frame
-from drivers.client import DriveClient, Saved
+from drivers.client import DriveClient
 from drivers.mapping import MEASURED
+from drivers.port import Saved
 from drivers.watch import CommandWatch
 from hil.app import Setup
 from hil.convert.periods import MOST_NS, Grid, Heard, Period, Roles, around

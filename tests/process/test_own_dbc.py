@@ -93,3 +93,14 @@ def test_an_emulator_that_speaks_another_protocol_is_refused(configs: Path, sett
         done = call(command, str(configs / "inverter.toml"), *flags(settings()))
         assert done.returncode != 0 and "Traceback" not in done.stderr
         assert "the emulated drive knows no MotorState (0x18FF1000, 12 bytes)" in done.stderr, done.stderr
+
+
+def test_an_emulator_that_counts_otherwise_says_so(configs: Path, settings: Settings) -> None:
+    edit(
+        configs / "drives/hil_pmsm.dbc",
+        "SG_ Counter : 8|4@1+ (1,0) [0|15]",
+        "SG_ Counter : 8|4@1+ (1,0) [1|15]",
+    )
+    done = call("emulate", str(configs / "demo.toml"), *flags(settings()))
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert "COMMAND.Counter begins with 1 by the DBC; the emulated drive counts from 0" in done.stderr
