@@ -432,7 +432,7 @@ def test_listening_knows_a_counters_range_and_odd_lengths(tmp_path: Path, channe
     for count in (13, 14, 1, 2, 4):
         far.send(0x98FF1000, bytes((0, 0, 1, count << 4, 0, 0, 0, 0)))
     far.send(0x98FF1000, bytes(6))
-    heard = listen(link, base, 0.2, {"MotorSpeed": "Alive"}).of("MotorSpeed")
+    heard = listen(link, base, 1.0, {"MotorSpeed": "Alive"}).of("MotorSpeed")
     assert (heard.jumps, heard.invalid, heard.odd_length) == (1, 1, 6)
     link.close()
     far.close()

@@ -159,7 +159,7 @@ def test_listening_keeps_each_selectors_newest(tmp_path: Path, channel: str) -> 
     link, far = (open_link(BusSettings("hil-local", channel)) for _ in range(2))
     for data in (bytes((0, 0x10, 100, 0, 0, 0, 0, 0)), bytes((7, 0x11, 0xE0, 0x15, 0, 0, 0, 0))):
         far.send(0x181, data)
-    values = listen(link, base, 0.2, {"Say": "Count"}).of("Say").values
+    values = listen(link, base, 1.0, {"Say": "Count"}).of("Say").values
     assert values["Speed"] == pytest.approx(10.0) and values["Udc"] == pytest.approx(560.0)
     assert "Id" not in values
     link.close()
