@@ -21,6 +21,7 @@ from hil.errors import HilError
 
 BATCH_TICKS: Final = 700_000
 """Ticks of a batch: about half a second of a core; what a lost worker takes along."""
+WORKERS_OF_SHORT: Final = 64
 ALONE_TICKS: Final = 400_000
 """A campaign of fewer ticks is done sooner in this process than workers are started."""
 PAGE: Final = "report.html"
@@ -96,9 +97,13 @@ def ticks_of(stand: Stand) -> int:
 
 
 def batch_size(ticks: int, count: int, workers: int) -> int:
-    """Cases of a batch: half a second of work, and for few cases enough batches for all."""
+    """Cases of a batch: half a second of work, and for few cases enough batches for all.
+
+    With many workers longer, so that one scheduler keeps up with them.
+    """
     fair = math.ceil(count / (engine.IN_FLIGHT * max(1, workers)))
-    return max(1, min(BATCH_TICKS // ticks, fair))
+    long = BATCH_TICKS * max(1, workers // WORKERS_OF_SHORT) // ticks
+    return max(1, min(long, fair))
 
 
 def where(stand: Stand, workers: int | None, scheduler: str | None) -> Workers:

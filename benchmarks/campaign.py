@@ -1,0 +1,182 @@
+"""What a case of a campaign costs, beside a case as it was simulated before, and how workers add up.
+
+    python -m benchmarks.campaign [--json] [--cases N] [--full]
+
+Processor time and ratios of one run, so that other load on the machine matters little:
+
+* a case of the demo (6 s at 1 kHz) from plan to row, its simulation alone, and a case with the set-up
+  done anew, as `hil simulate --sweep` did until campaigns came: files read, DBC parsed, law designed;
+* the same with the controller varied, which is designed for each case;
+* one worker and two over N cases: wall time, processor time of all, and peak memory of a worker;
+* `--full`: 10,000 and 100,000 cases on two workers;
+* motulator's own loop over the same motor at the same control rate. It integrates the motor with scipy's
+  adaptive RK45 between control steps and keeps each step; we advance a Taylor series of order 8 twice a tick,
+  through the wire's resolution, guard and supervisor, and keep figures. Neither does all that the other does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from benchmarks.__main__ import HERE, peer
+from hil.app import Overrides, load_setup
+from hil.bench.machine import machine_facts
+from hil.campaign.case import job_of
+from hil.campaign.plan import read_plan
+from hil.campaign.run import campaign
+from hil.report.segments import Responses
+from hil.report.statistics import Totals
+from hil.shipped import find_config
+from hil.simulate import simulate_ticks
+from hil.view import key_values, show
+
+REPEATS = 40
+PLANT = """[random]
+"plant:motor.J_kg_m2" = { percent = 20 }
+"plant:motor.R_s_ohm" = { percent = 20 }
+"""
+LAW = '"controller.speed_pole_rad_s" = { percent = 20 }\n'
+
+
+def plan_file(folder: Path, cases: int, text: str = PLANT) -> Path:
+    """A plan of the demo."""
+    path = folder / f"plan{cases}.toml"
+    config = json.dumps(str(find_config("demo.toml").resolve()))
+    path.write_text(f"config = {config}\nsamples = {cases}\n{text}", encoding="utf-8")
+    return path
+
+
+def fastest_ms(*works: Callable[[int], Any]) -> list[float]:
+    """Processor time [ms] of the fastest of many, by turns so that all see the same machine."""
+    best = [float("inf")] * len(works)
+    for turn in range(REPEATS + 1):
+        for place, work in enumerate(works):
+            begin = time.process_time()
+            work(turn)
+            best[place] = min(best[place], time.process_time() - begin) if turn else best[place]
+    return [1e3 * seconds for seconds in best]
+
+
+def as_before(case: int) -> None:
+    """A case with its set-up done anew and judged as a whole run in memory."""
+    setup = load_setup(find_config("demo.toml"), Overrides(settings=("bus.fd=false",)))
+    ticks = simulate_ticks(setup, [f"motor.J_kg_m2={0.01 + 1e-5 * case}"])
+    load_setup(find_config("demo.toml"), Overrides())  # the plant's DBC and tables, for the judgement
+    totals, responses, t = Totals(), Responses(), ticks["t_ns"] * 1e-9
+    with np.errstate(all="ignore"):
+        totals.feed(t, ticks)
+        responses.feed(t, ticks)
+        responses.finish()
+
+
+def one_case(folder: Path) -> dict[str, float]:
+    """A case from plan to row, its parts, and one as before [ms of a core]."""
+    plan = plan_file(folder, 100_000)
+    _, stand = job_of(plan, read_plan(plan))
+    _, law = job_of(plan, read_plan(plan_file(folder, 99_999, PLANT + LAW)))
+
+    def loop(case: int) -> None:
+        for _ in made[case].blocks():
+            pass
+
+    made = [stand.simulation(stand.plan.settings(case), 1)[1] for case in range(REPEATS + 1)]
+    case, simulated, designed, before = fastest_ms(stand.run, loop, law.run, as_before)
+    ticks = 6000
+    return {
+        "case_ms": case,
+        "simulation_ms": simulated,
+        "simulation_us_a_tick": 1e3 * simulated / ticks,
+        "case_with_design_ms": designed,
+        "as_before_ms": before,
+        "as_before_over_case": before / case,
+    }
+
+
+@contextlib.contextmanager
+def watched(found: dict[str, float]) -> Iterator[None]:
+    """Peak memory of the largest process below this one [MB], and processor seconds of all of them."""
+    stop, seconds = threading.Event(), dict[int, float]()
+
+    def look() -> None:
+        while not stop.wait(0.1):
+            for process in psutil.Process().children(recursive=True):
+                with contextlib.suppress(psutil.Error):
+                    found["peak_mb"] = max(found.get("peak_mb", 0.0), process.memory_info().rss / 1e6)
+                    used = process.cpu_times()
+                    seconds[process.pid] = used.user + used.system
+
+    own, thread = os.times(), threading.Thread(target=look)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        now = os.times()
+        found["client_s"] = now.user + now.system - own.user - own.system
+        found["workers_s"] = sum(seconds.values())
+
+
+def whole(folder: Path, cases: int, workers: int) -> dict[str, float]:
+    """A campaign from start to report."""
+    found: dict[str, float] = {}
+    begin = time.perf_counter()
+    with watched(found):
+        result = campaign(plan_file(folder, cases), folder / f"{cases}-{workers}", workers=workers)
+    size = sum(path.stat().st_size for path in (result.folder.path / "rows").iterdir())
+    wall = time.perf_counter() - begin
+    return found | {"wall_s": wall, "passed": result.passed, "bytes_a_case": size / cases}
+
+
+def measure(cases: int, full: bool) -> dict[str, Any]:
+    """Everything, by name."""
+    with tempfile.TemporaryDirectory(prefix="hil-bench-") as name:
+        folder = Path(name)
+        found: dict[str, Any] = {"a case": one_case(folder)}
+        runs = [(cases, 1), (cases, 2), *([(10_000, 2), (100_000, 2)] if full else [])]
+        for count, workers in runs:
+            found[f"{count} cases, workers {workers}"] = whole(folder, count, workers)
+    one, two = (found[f"{cases} cases, workers {n}"]["wall_s"] for n in (1, 2))
+    return found | {
+        "one worker over two": one / two,
+        "motulator": peer(sys.executable, str(HERE / "motulator_drive.py")),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.campaign", description=__doc__)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--cases", type=int, default=4000)
+    parser.add_argument("--full", action="store_true")
+    args = parser.parse_args()
+    found = measure(args.cases, args.full) | {"machine": machine_facts()}
+    if args.json:
+        sys.stdout.write(json.dumps(found, indent=2) + "\n")
+        return
+    rows = {
+        name: ", ".join(
+            f"{key} {item:.4g}" if isinstance(item, float) else f"{key} {item}" for key, item in value.items()
+        )
+        if isinstance(value, dict)
+        else value
+        for name, value in found.items()
+    }
+    show(key_values("campaigns", rows))
+
+
+if __name__ == "__main__":
+    main()
