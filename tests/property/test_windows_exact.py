@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from hil.control.noise import least_noise, noise_matrix, weights_of_noise
 from hil.control.observer import bounds, impulse_response, response_length
 from hil.control.observers.least_noise import closed_form
 from hil.control.registry import Channel, observers
+from tests.conftest import ROOT
 
 T_S = 1e-3
 MOTOR = MotorModel(2.875, 0.033, 0.033, 0.8, 3, 0.011, 2e-4)
@@ -193,3 +195,17 @@ def test_the_eso_has_its_poles_and_bounds_count_it() -> None:
     np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=1e-9)
     assert (weights[:, 0] * (np.arange(length) + 0.5)).sum() * T_S == pytest.approx(1 / 200.0, rel=0.2)
     assert np.isfinite(bounds(window, MODEL.Ad, MODEL.Ed, T_S, np.ones(3)).resolution).all()
+
+
+def test_the_page_on_extending_shows_a_window_that_works() -> None:
+    text = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    told: dict[str, Any] = {}
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(example, told)  # noqa: S102 - what the page says is what is tried
+    member = told["MEMBER"]
+    g = impulse_response(member.design({"delay_ms": 12.0}, Channel(0, T_S, MODEL)), 13)[:, 0]
+    assert g.sum() == pytest.approx(1.0, rel=1e-12) and g[11] > 0 and g[12] == 0
+    Q = noise_matrix(12, 2.0, 1.0)
+    assert math.sqrt(
+        g[:12] @ Q @ g[:12] / (closed_form(12, 0.0) @ Q @ closed_form(12, 0.0))
+    ) == pytest.approx(1.11, abs=0.01)

@@ -1,6 +1,6 @@
 """The cubic window g ~ s (1 - s)^2, s = (j + 1) / (N + 1): least noise for its lag, no weight negative.
 
-Exact for a constant d; lag 0.4 D; its noise is that of a parabola of 0.8 D.
+Exact for a constant d; lag 0.4 D; its noise is that of a parabola of 0.85 D, 1.26 times the least.
 """
 
 from __future__ import annotations
