@@ -5,12 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 
 from hil.control.errors import ControlDesignError
 from hil.control.fac import SINGULAR, SampledModel
 from hil.control.jit import jit
-from hil.control.linalg import Array, matvec, matvec_add
+from hil.control.linalg import (
+    Array,
+    halvings_of,
+    integral_exponential,
+    inverse,
+    matvec,
+    matvec_add,
+    product,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,18 +50,16 @@ def _check(B: Array, Upsilon: Array, Z: Array) -> tuple[Array, Array, Array]:
 def continuous_gain(A: Array, B: Array, Upsilon: Array, Z: Array) -> Array:
     """Pi = B^-1 (Z Upsilon - A Z) Z^-1, eqs. (24)-(26)."""
     B, Upsilon, Z = _check(B, Upsilon, Z)
-    gain: Array = np.linalg.solve(B, Z @ Upsilon - np.asarray(A, float) @ Z) @ np.linalg.inv(Z)
-    return gain
+    return product(inverse(B), product(product(Z, Upsilon) - product(np.array(A, float), Z), inverse(Z)))
 
 
 def composite_gain(model: SampledModel, Upsilon: Array, Z: Array) -> CompositeGain:
     """Sampled gain Pi_d = Bd^-1 (Z e^{Upsilon T_s} Z^-1 - Ad): closed loop e^{Upsilon T_s} exactly."""
     _, Upsilon, Z = _check(model.B, Upsilon, Z)
-    closed = Z @ expm(Upsilon * model.T_s) @ np.linalg.inv(Z)
-    Bd_inv = np.linalg.inv(model.Bd)
-    return CompositeGain(
-        continuous_gain(model.A, model.B, Upsilon, Z), Bd_inv @ (closed - model.Ad), closed, Bd_inv
-    )
+    decay, _ = integral_exponential(Upsilon, model.T_s, halvings_of(Upsilon, model.T_s))
+    closed, Bd_inv = product(product(Z, decay), inverse(Z)), inverse(model.Bd)
+    Pi_d = product(Bd_inv, closed - model.Ad)
+    return CompositeGain(continuous_gain(model.A, model.B, Upsilon, Z), Pi_d, closed, Bd_inv)
 
 
 @jit

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm
 
 from hil.control.errors import ControlDesignError
-from hil.control.linalg import Array
+from hil.control.linalg import Array, halvings_of, integral_exponential, inverse, product
 
 MAX_GAP = 64
 """Longest gap in the measurements [ticks] that a gap inverse is kept for."""
@@ -45,7 +44,7 @@ class SampledModel:
 
 
 def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledModel:
-    """Sample x' = A x + B u + d exactly with the matrix exponential of [[A, I], [0, 0]] T_s.
+    """Sample x' = A x + B u + d exactly with e^{A T_s} and its integral, of the same bits on every machine.
 
     Raises ControlDesignError for shapes that do not fit, a T_s that is not positive, and a singular Ed
     (A then has an eigenvalue 2 pi j k / T_s; take another T_s). A singular gap sum only ends ``gap_inverse``.
@@ -58,30 +57,28 @@ def sample(A: Array, B: Array, T_s: float, max_gap: int = MAX_GAP) -> SampledMod
         raise ControlDesignError("A and B must be finite")
     if not T_s > 0:
         raise ControlDesignError(f"T_s must be positive, not {T_s}")
-    augmented = np.zeros((2 * n, 2 * n))
-    augmented[:n, :n], augmented[:n, n:] = A, np.eye(n)
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable A may overflow: the checks see it
-        exponential = expm(augmented * T_s)
-        Ad, Ed = exponential[:n, :n], exponential[:n, n:]
+        Ad, Ed = integral_exponential(A, float(T_s), halvings_of(A, T_s))
         inverses = _gap_inverses(Ad, Ed, T_s, max_gap)
-    return SampledModel(A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(Ed @ B), inverses)
+    return SampledModel(A, B, T_s, _frozen(Ad), _frozen(Ed), _frozen(product(Ed, B)), inverses)
 
 
 def _gap_inverses(Ad: Array, Ed: Array, T_s: float, max_gap: int) -> Array:
     """(sum_{j<m} Ad^j Ed)^-1 for m = 1 .. max_gap or the last regular one; shape (count, n, n)."""
     n = Ad.shape[0]
-    integrals = np.zeros((max_gap, n, n))
-    power, total = np.eye(n), np.zeros((n, n))
+    integrals: Array = np.zeros((max_gap, n, n))
+    power: Array = np.eye(n)
+    total: Array = np.zeros((n, n))
     for m in range(max_gap):
-        total = total + power @ Ed
-        power = power @ Ad
+        total = total + product(power, Ed)
+        power = product(power, Ad)
         integrals[m] = total
     count = _regular(integrals, T_s)
     if not count:
         raise ControlDesignError(
             "Ed is singular or not finite: A has an eigenvalue 2 pi j k / T_s; change T_s"
         )
-    return _frozen(np.linalg.inv(integrals[:count]))
+    return _frozen(np.array([inverse(integral) for integral in integrals[:count]]))
 
 
 def _regular(integrals: Array, T_s: float) -> int:

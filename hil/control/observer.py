@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 
 from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
-from hil.control.linalg import Array, Index
+from hil.control.linalg import Array, Index, exp, power
 
 SINGULAR = 1e-9
 """|lam_1^N - lam_2^N| / max lam^N at and below which Theorem 1's matrix counts as singular (Theta > 1e9)."""
@@ -95,8 +95,8 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
             "[G, Lam^N G] singular (Theorem 1, 2); move one of them"
         )
     N: Index = np.rint(delay / T_s).astype(np.int64)
-    lam = np.exp(-gamma * T_s)
-    lam_N: Array = lam**N
+    lam = _decay(gamma, T_s)
+    lam_N: Array = np.array([[power(x, n) for x, n in zip(row, N, strict=True)] for row in lam])
     determinant = lam_N[1] - lam_N[0]
     singular = np.abs(determinant) <= SINGULAR * lam_N.max(axis=0)  # relative: both lam^N may be tiny
     if singular.any():
@@ -107,6 +107,11 @@ def ftdob(gamma_1: Array, gamma_2: Array, delay_s: Array | float, T_s: float) ->
             "move the poles apart or change D"
         )
     return Window(lam, lam_N, np.array([lam_N[1] / determinant, -lam_N[0] / determinant]), N)
+
+
+def _decay(gamma: Array, T_s: float) -> Array:
+    """e^{-gamma T_s}, entry by entry, the same to the bit on every machine."""
+    return np.array([exp(float(-g * T_s)) for g in gamma.ravel()]).reshape(gamma.shape)
 
 
 def _check_tick(T_s: float) -> None:
@@ -121,7 +126,7 @@ def conventional_dob(gamma_c: Array, T_s: float) -> Window:
     if not (np.isfinite(gamma).all() and (gamma > 0).all()):
         raise ControlDesignError(f"Gamma_c must be positive, not {gamma}")
     _check_tick(T_s)
-    lam = np.exp(-gamma * T_s)
+    lam = _decay(gamma, T_s)
     zero = np.zeros_like(lam)
     return Window(
         np.array([lam, lam]),

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from hil.control.composite import composite_gain
+from hil.control.linalg import exp
 from hil.control.registry import Key, Law, Plan, Values
 
 CODE = 0
@@ -24,7 +24,7 @@ def design(values: Values, plan: Plan) -> dict[str, Any]:
     d_pole = values["current_pole_rad_s"] if d_pole is None else d_pole
     poles = (values["speed_pole_rad_s"], values["current_pole_rad_s"], d_pole)
     gain = composite_gain(plan.model, -np.diag(poles), np.eye(3))
-    lam = dict(zip(("lam_w", "lam_q", "lam_d"), (math.exp(-pole * plan.T_s) for pole in poles), strict=True))
+    lam = dict(zip(("lam_w", "lam_q", "lam_d"), (exp(-pole * plan.T_s) for pole in poles), strict=True))
     return {**lam, "closed": gain.closed, "Bd_inv": gain.Bd_inv}
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from hil.control.errors import ControlDesignError
+from hil.control.linalg import exp
 from hil.control.noise import NOISE, noise_matrix, weights_of_noise
 from hil.control.observer import Window, exponentials
 from hil.control.registry import Channel, Key, Observer, Values
@@ -21,7 +22,7 @@ def design(values: Values, channel: Channel) -> Window:
     gamma, N = np.array(values["gammas_rad_s"], float), round(values["delay_ms"] * 1e-3 / channel.T_s)
     if len(gamma) > N:
         raise ControlDesignError(f"D = {values['delay_ms']:g} ms is {N} ticks, fewer than poles; lengthen D")
-    lam = np.exp(-gamma * channel.T_s)
+    lam = np.array([exp(-g * channel.T_s) for g in gamma])
     E = (1 - lam)[:, None] * lam[:, None] ** np.arange(N)
     diagonal, neighbour = weights_of_noise(channel, values)
     inner, c = E @ noise_matrix(N, diagonal, neighbour) @ E.T, 1 - lam**N
