@@ -46,10 +46,49 @@ class PlantMotor(Table):
 
 
 class Inverter(Table):
-    """DC link and resolution of the modulator (0: none)."""
+    """DC link and resolution of the modulator (0: none).
+
+    Without ``capacitance_f`` the link stays at ``v_dc_v``. With it a rectifier of that no-load voltage feeds
+    a capacitor, and what the motor gives back goes there, into the brake resistor from ``brake_on_v`` down
+    to ``brake_off_v``; above ``v_dc_trip_v`` the drive trips.
+    """
 
     v_dc_v: Positive = 540.0
     resolution_v: NonNegative = 0.02
+    capacitance_f: Positive | None = None
+    rectifier_ohm: Positive = 0.5
+    brake_ohm: Positive | None = None
+    brake_on_v: Positive | None = None
+    brake_off_v: Positive | None = None
+    v_dc_trip_v: Positive | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Inverter:
+        brake = (self.brake_ohm, self.brake_on_v, self.brake_off_v)
+        more = [value for value in (*brake, self.v_dc_trip_v) if value is not None]
+        if more and self.capacitance_f is None:
+            raise ValueError(
+                "brake_*_v, brake_ohm and v_dc_trip_v need capacitance_f; v_dc is constant without"
+            )
+        if any(value is not None for value in brake) and None in brake:
+            raise ValueError("brake_ohm, brake_on_v and brake_off_v belong together")
+        if self.brake_on_v and self.brake_off_v and not self.v_dc_v < self.brake_off_v < self.brake_on_v:
+            raise ValueError("v_dc_v < brake_off_v < brake_on_v must hold, or the brake never rests")
+        return self
+
+
+class Friction(Table):
+    """Dry friction of the shaft: T = sgn(w) (T_c + (T_s - T_c) e^{-|w| / w_s}); it sticks up to T_s."""
+
+    coulomb_n_m: NonNegative = 0.0
+    static_n_m: NonNegative | None = None
+    stribeck_rad_s: Positive = 1.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Friction:
+        if self.static_n_m is not None and self.static_n_m < self.coulomb_n_m:
+            raise ValueError("static_n_m is the larger one: at least coulomb_n_m")
+        return self
 
 
 class Sensors(Table):
@@ -94,6 +133,21 @@ class StepLoad(Table):
         return self
 
 
+class BrakeLoad(Table):
+    """A brake: dry friction from one time until another; it holds the shaft and never drives it."""
+
+    kind: Literal["brake"]
+    torque_n_m: NonNegative
+    at_s: NonNegative = 0.0
+    until_s: Positive | None = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> BrakeLoad:
+        if self.until_s is not None and self.until_s <= self.at_s:
+            raise ValueError(f"until_s = {self.until_s} is not after at_s = {self.at_s}")
+        return self
+
+
 class SineLoad(Table):
     """A sinusoidal torque."""
 
@@ -121,7 +175,9 @@ class CouplerLoad(Table):
     other_side_rad_s: Finite = 0.0
 
 
-Load = Annotated[ConstantLoad | StepLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")]
+Load = Annotated[
+    ConstantLoad | StepLoad | BrakeLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")
+]
 
 
 class Disturbance(Table):
@@ -155,6 +211,7 @@ class PlantConfig(Table):
     inverter: Inverter = Inverter()
     sensors: Sensors = Sensors()
     firmware: Firmware = Firmware()
+    friction: Friction = Friction()
     disturbance: Disturbance = Disturbance()
     load: Annotated[list[Load], Field(max_length=MAX_LOADS)] = []
     fault: list[Fault] = []
@@ -189,8 +246,9 @@ def _load_row(load: Any) -> tuple[int, float, float, float]:
     """Kind and the parameters a, b, c of one load, as :data:`firmware_model.plant.PARAMS` says."""
     if isinstance(load, ConstantLoad):
         return int(LoadKind.CONSTANT), load.torque_n_m, 0.0, 0.0
-    if isinstance(load, StepLoad):
-        return int(LoadKind.STEP), load.torque_n_m, load.at_s, load.until_s or math.inf
+    if isinstance(load, (StepLoad, BrakeLoad)):
+        kind = LoadKind.BRAKE if isinstance(load, BrakeLoad) else LoadKind.STEP
+        return int(kind), load.torque_n_m, load.at_s, load.until_s or math.inf
     if isinstance(load, SineLoad):
         return int(LoadKind.SINE), load.torque_n_m, load.frequency_hz, load.phase_rad
     if isinstance(load, FanLoad):
@@ -202,7 +260,7 @@ def _load_row(load: Any) -> tuple[int, float, float, float]:
 def build_params(config: PlantConfig, wire: Wire) -> Record:
     """The parameter record of a plant: a one-element array of PARAMS."""
     p = np.zeros(1, PARAMS)
-    motor, firmware, inverter = config.motor, config.firmware, config.inverter
+    motor, firmware, inverter, friction = config.motor, config.firmware, config.inverter, config.friction
     values: dict[str, float] = {
         "R_s": motor.R_s_ohm,
         "L_d": motor.L_d_h,
@@ -233,13 +291,24 @@ def build_params(config: PlantConfig, wire: Wire) -> Record:
         "thermal_time": firmware.thermal_time_s,
         "status_every": firmware.status_every,
         "seed": config.seed,
+        "coulomb": friction.coulomb_n_m,
+        "static": friction.coulomb_n_m if friction.static_n_m is None else friction.static_n_m,
+        "stribeck": friction.stribeck_rad_s,
+        "capacitance": inverter.capacitance_f or 0.0,
+        "rectifier": inverter.rectifier_ohm,
+        "brake_resistance": inverter.brake_ohm or math.inf,
+        "brake_on": inverter.brake_on_v or math.inf,
+        "brake_off": inverter.brake_off_v or 0.0,
+        "v_trip": inverter.v_dc_trip_v or math.inf,
     }
     for name, value in values.items():
         p[name] = value
     for j, load in enumerate(config.all_loads):
         p["load_kind"][0, j], p["load_a"][0, j], p["load_b"][0, j], p["load_c"][0, j] = _load_row(load)
     p["loads"] = len(config.all_loads)
-    p["varying"] = int((p["load_kind"] > LoadKind.STEP).any())
+    kinds = p["load_kind"]
+    p["varying"] = int(((kinds > LoadKind.STEP) & (kinds < LoadKind.BRAKE)).any())
+    p["rubs"] = int(bool(p["static"][0] > 0.0) or bool((kinds == LoadKind.BRAKE).any()))
     return p
 
 
@@ -249,6 +318,7 @@ def new_state(p: Record, echo_none: int) -> Record:
     s["state"] = int(State.SWITCH_ON_DISABLED)
     s["echo"] = echo_none
     s["temperature"] = p["ambient"]
+    s["v_dc"] = p["v_dc"]
     s["random"] = p["seed"]
     return s
 

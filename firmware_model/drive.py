@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from firmware_model.jit import jit
+from firmware_model.link import link_voltage
 from firmware_model.load import edge_after, load_torque
 from firmware_model.motor import move
 from firmware_model.plant import PROTOCOL_VERSION, ErrorCode, State
+from firmware_model.rub import friction_torque, rub
 from firmware_model.sensors import measure, whole_degrees
 
 
@@ -49,6 +51,8 @@ def protect(p: Any, s: Any) -> None:
         trip(s, ErrorCode.OVER_CURRENT.value)
     if abs(x[0]) > p["w_trip"]:
         trip(s, ErrorCode.OVER_SPEED.value)
+    if s["v_dc"] > p["v_trip"]:
+        trip(s, ErrorCode.DC_LINK_OVER_VOLTAGE.value)
     if s["temperature"] > p["temperature_trip"]:
         trip(s, ErrorCode.OVER_TEMPERATURE_MOTOR.value)
 
@@ -81,7 +85,10 @@ def advance(p: Any, s: Any, dt_ns: int) -> None:
             edge = edge_after(p, s["t_ns"] + step)
         h = step * 1e-9
         on = s["state"] == State.OPERATION_ENABLED
-        move(p, s["x"], s["series"], s["t_ns"] * 1e-9, h, s["u_q"], s["u_d"], s["T_commanded"], on)
+        if p["rubs"] or p["capacitance"] > 0.0:
+            rub(p, s, s["t_ns"] * 1e-9, h, on)
+        else:
+            move(p, s["x"], s["series"], s["t_ns"] * 1e-9, h, s["u_q"], s["u_d"], s["T_commanded"], on)
         s["t_ns"] += step
         left -= step
         protect(p, s)  # first, so that no absurd current heats the motor
@@ -149,7 +156,7 @@ def latch(p: Any, s: Any) -> None:
     u_q, u_d = s["next_q"], s["next_d"]
     if p["u_lsb"] > 0.0:
         u_q, u_d = np.rint(u_q / p["u_lsb"]) * p["u_lsb"], np.rint(u_d / p["u_lsb"]) * p["u_lsb"]
-    limit = p["v_dc"] / math.sqrt(3.0)
+    limit = link_voltage(p, s) / math.sqrt(3.0)
     norm = math.sqrt(u_q * u_q + u_d * u_d)
     s["limited"] = 1 if norm > limit else 0
     scale = limit / norm if norm > limit else 1.0
@@ -170,7 +177,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     out["i_d"] = measure(s, x[2], p["i_noise"], p["i_d_lsb"], p["i_d_top"])
     out["echo"], out["state"], out["limited"] = s["echo"], s["state"], s["limited"]
     out["protocol_version"] = PROTOCOL_VERSION
-    out["v_dc"] = min(np.rint(p["v_dc"] / 0.1), 65535.0) * 0.1
+    out["v_dc"] = min(np.rint(link_voltage(p, s) / 0.1), 65535.0) * 0.1
     out["temperature_motor"] = whole_degrees(s["temperature"])
     out["temperature_inverter"] = whole_degrees(p["ambient"])
     out["error"] = s["error"]
@@ -179,5 +186,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     s["emcy"] = 0
     s["syncs"] += 1
     t = s["t_ns"] * 1e-9
-    out["T_L_true"] = np.float64(np.float32(load_torque(p, t, x[0]) + s["T_commanded"]))
+    out["T_L_true"] = np.float64(
+        np.float32(load_torque(p, t, x[0]) + s["T_commanded"] + friction_torque(p, s, t))
+    )
     out["w_true"] = np.float64(np.float32(x[0]))

@@ -132,7 +132,7 @@ class PlantFaults:
                 continue
             changed = isinstance(fault, (OverTemperature, BrownOut))
             if isinstance(fault, DcLink):
-                p["v_dc"] = fault.v_dc_v
+                p["v_dc"] = s["v_dc"] = fault.v_dc_v  # the link stands there, with or without a capacitor
                 changed = p["v_dc"] != own["v_dc"]
             elif isinstance(fault, Noise):
                 p["w_noise"], p["i_noise"] = fault.w_noise_rad_s, fault.i_noise_a

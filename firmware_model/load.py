@@ -56,10 +56,10 @@ def load_torque(p: Any, t: float, w: float) -> float:
 
 @jit
 def edge_after(p: Any, t_ns: int) -> float:
-    """Time [ns] of the next edge of a step load, infinite if there is none: a series must not cross it."""
+    """Time [ns] of the next edge of a step or brake, infinite if there is none: no series must cross it."""
     nearest = math.inf
     for j in range(MAX_LOADS):
-        if p["load_kind"][j] == LoadKind.STEP:
+        if p["load_kind"][j] == LoadKind.STEP or p["load_kind"][j] == LoadKind.BRAKE:
             for edge in (p["load_b"][j] * 1e9, p["load_c"][j] * 1e9):
                 if t_ns + 0.5 < edge < nearest:
                     nearest = edge

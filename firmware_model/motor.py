@@ -16,9 +16,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from firmware_model.friction import level, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import load_coefficient, one_load
-from firmware_model.plant import ORDER, LoadKind
+from firmware_model.plant import DRIVE, ORDER, SLIDE, LoadKind
 from firmware_model.series import evaluate, products
 
 
@@ -37,7 +38,7 @@ def varying_load(p: Any, c: Any, t: float, k: int) -> float:
     """Coefficient k of the sum of the loads that vary; each load's own goes to its row of ``c``."""
     total = 0.0
     for j in range(p["loads"]):
-        if p["load_kind"][j] > LoadKind.STEP:
+        if LoadKind.STEP < p["load_kind"][j] < LoadKind.BRAKE:
             c[3 + j, k] = load_coefficient(p, c, j, t, k)
             total += c[3 + j, k]
     return total
@@ -49,7 +50,8 @@ def series(
 ) -> None:
     """Coefficients of w, i_q, i_d [unit / s^k] about t [s] in rows 0 to 2 of ``c``, for a step of h [s].
 
-    With the gates off no current flows and only the shaft moves.
+    With the gates off no current flows and only the shaft moves. With friction the shaft slides the way that
+    row SLIDE says, or sticks; what drives it goes to row DRIVE.
     """
     n_p, R_s, L_d, L_q, inverse_J = p["n_p"], p["R_s"], p["L_d"], p["L_q"], 1.0 / p["J"]
     inverse_d, inverse_q = 1.0 / L_d, 1.0 / L_q
@@ -57,6 +59,7 @@ def series(
     w, q, d = c[0], c[1], c[2]
     w[0], q[0], d[0] = x[0], x[1], x[2]
     T_constant = constant_load(p, t + 0.5 * h) + T_commanded
+    slide, T_coulomb = (c[SLIDE, 0], level(p, t + 0.5 * h)) if p["rubs"] else (1.0, 0.0)
     for k in range(ORDER):
         share = 1.0 / (k + 1)
         wq, wd, qd = products(w, q, d, k)
@@ -70,6 +73,10 @@ def series(
             dw += p["phi_w"] - T_constant * inverse_J
             dq += p["phi_q"] + u_q * inverse_q
             dd += u_d * inverse_d
+        if p["rubs"]:
+            c[DRIVE, k] = dw / inverse_J
+            dw -= slide * ((T_coulomb if k == 0 else 0.0) + stribeck_coefficient(p, c, k)) * inverse_J
+            dw *= abs(slide)
         w[k + 1] = dw * share
         q[k + 1], d[k + 1] = (dq * share, dd * share) if on else (0.0, 0.0)
 

@@ -13,6 +13,11 @@ import numpy as np
 MAX_LOADS: Final = 8
 ORDER: Final = 8
 """Order of the motor's Taylor series."""
+SLIDE: Final = 3 + MAX_LOADS
+"""Row of the series' room that holds which way the shaft slides: -1, 1, or 0 while it sticks."""
+DRIVE, STRIBECK, LINK, INVERSE, POWER = range(SLIDE + 1, SLIDE + 6)
+"""Rows: torque that drives the shaft without friction; e^{-|w| / w_s}; DC link, its inverse, motor power."""
+ROWS: Final = POWER + 1
 PROTOCOL_VERSION: Final = 1
 
 
@@ -51,6 +56,7 @@ class LoadKind(IntEnum):
     SINE = 3
     FAN = 4
     COUPLER = 5
+    BRAKE = 6
 
 
 PARAMS: Final = np.dtype(
@@ -91,19 +97,30 @@ PARAMS: Final = np.dtype(
         ("load_b", "f8", MAX_LOADS),
         ("load_c", "f8", MAX_LOADS),
         ("load_d", "f8", MAX_LOADS),
+        ("rubs", "i8"),
+        ("coulomb", "f8"),
+        ("static", "f8"),
+        ("stribeck", "f8"),
+        ("capacitance", "f8"),
+        ("rectifier", "f8"),
+        ("brake_resistance", "f8"),
+        ("brake_on", "f8"),
+        ("brake_off", "f8"),
+        ("v_trip", "f8"),
     ],
     align=True,
 )
 """Motor, inverter, sensors, firmware and loads. SI units; ``*_lsb`` 0 means no rounding.
 
 Loads use a..d as: constant (T); step (T, from, until); sine (T, frequency, phase); fan (k);
-coupler (T_max, slip at T_max, speed of the other side).
+coupler (T_max, slip at T_max, speed of the other side); brake (T, from, until). ``rubs`` 0: no friction, no
+brake; ``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage.
 """
 
 STATE: Final = np.dtype(
     [
         ("x", "f8", 3),
-        ("series", "f8", (3 + MAX_LOADS, ORDER + 1)),
+        ("series", "f8", (ROWS, ORDER + 1)),
         ("t_ns", "i8"),
         ("started", "i8"),
         ("u_q", "f8"),
@@ -126,6 +143,8 @@ STATE: Final = np.dtype(
         ("temperature", "f8"),
         ("syncs", "i8"),
         ("random", "i8"),
+        ("v_dc", "f8"),
+        ("braking", "i8"),
     ],
     align=True,
 )

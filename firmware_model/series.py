@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from firmware_model.jit import jit
@@ -35,3 +36,54 @@ def evaluate(a: Any, h: float) -> float:
     for k in range(ORDER - 1, -1, -1):
         value = value * h + a[k]
     return float(value)
+
+
+LOOKS = 8
+"""Places at which a series is looked at for a change of sign."""
+
+
+@jit
+def within(a: Any, h: float, error: float) -> float:
+    """Largest step up to h whose last term |a_ORDER| h^ORDER is below ``error`` (A. Jorba, M. Zou, 2005)."""
+    last = abs(a[ORDER])
+    if last * h**ORDER <= error:
+        return h
+    return float(max((error / last) ** (1.0 / ORDER), 1e-3 * h))
+
+
+@jit
+def first_crossing(a: Any, value: float, h: float) -> float:
+    """First time in (0, h] at which the series has passed ``value``, to rounding; infinite if it does not.
+
+    What begins at ``value`` has passed it once it is on the other side of where it first went.
+    """
+    side, before = a[0] - value, 0.0
+    for n in range(1, LOOKS + 1):
+        now = h * n / LOOKS
+        here = evaluate(a, now) - value
+        if side == 0.0:
+            side = here
+        if (side > 0.0 and here < 0.0) or (side < 0.0 and here > 0.0):
+            return bisected(a, value, before, now, side > 0.0)
+        before = now
+    return math.inf
+
+
+@jit
+def bisected(a: Any, value: float, low: float, high: float, above: bool) -> float:
+    """The crossing between ``low``, before it, and ``high``, after it."""
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if (evaluate(a, middle) > value) == above:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+@jit
+def shifted(a: Any, h: float) -> None:
+    """The series about h instead of 0, in place: repeated synthetic division."""
+    for i in range(ORDER):
+        for k in range(ORDER - 1, i - 1, -1):
+            a[k] += h * a[k + 1]

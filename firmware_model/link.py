@@ -1,0 +1,81 @@
+"""The DC link: capacitor, rectifier, brake resistor, and the power that the motor takes or gives back.
+
+    C dv/dt = i_r - i_b - P / v,  i_r = max(V_0 - v, 0) / R_r,  i_b = v / R_b while the chopper is on
+    P = 1.5 (u_q i_q + u_d i_d)
+The chopper goes on at v_on and off at v_off. Between two such edges v has a Taylor series, as the motor has;
+each edge is found on it and the next series begins there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from firmware_model.jit import jit
+from firmware_model.plant import INVERSE, LINK, ORDER, POWER
+from firmware_model.series import evaluate, first_crossing, product, shifted, within
+
+LINK_ERROR_V = 1e-7
+"""Last term of the series that a step may have [V]."""
+EDGES = 1000
+"""Steps and edges that one substep may have; beyond, it takes what is left in one."""
+LEAST_V = 1.0
+"""An empty link: below, P / v would have no sense."""
+
+
+@jit
+def link_voltage(p: Any, s: Any) -> float:
+    """Voltage of the DC link [V]."""
+    return float(s["v_dc"]) if p["capacitance"] > 0.0 else float(p["v_dc"])
+
+
+@jit
+def conducts(p: Any, s: Any, power: float) -> bool:
+    """Whether the rectifier feeds the link; at V_0 it depends on where the voltage is going."""
+    v = s["v_dc"]
+    drained = power / v + (v / p["brake_resistance"] if s["braking"] else 0.0)
+    return bool(v < p["v_dc"] or (v == p["v_dc"] and drained > 0.0))
+
+
+@jit
+def link_series(p: Any, s: Any, c: Any, fed: bool) -> None:
+    """Coefficients of v in row LINK, from those of the motor's power in row POWER."""
+    v, inverse, power = c[LINK], c[INVERSE], c[POWER]
+    v[0], inverse[0] = s["v_dc"], 1.0 / s["v_dc"]
+    conductance = (1.0 / p["rectifier"] if fed else 0.0) + (
+        1.0 / p["brake_resistance"] if s["braking"] else 0.0
+    )
+    for k in range(ORDER):
+        current = -conductance * v[k] - product(power, inverse, k)
+        if k == 0 and fed:
+            current += p["v_dc"] / p["rectifier"]
+        v[k + 1] = current / (p["capacitance"] * (k + 1))
+        total = 0.0
+        for j in range(1, k + 2):
+            total += v[j] * inverse[k + 1 - j]
+        inverse[k + 1] = -total * inverse[0]
+
+
+@jit
+def advance_link(p: Any, s: Any, c: Any, h: float) -> None:
+    """Advance the link by h [s]; row POWER holds the motor's power about the beginning of h."""
+    if s["v_dc"] >= p["brake_on"]:
+        s["braking"] = 1
+    left = h
+    for n in range(EDGES):
+        fed = conducts(p, s, c[POWER, 0])
+        link_series(p, s, c, fed)
+        step = left if n == EDGES - 1 else within(c[LINK], left, LINK_ERROR_V)
+        edge = p["brake_off"] if s["braking"] else p["brake_on"]
+        at_edge = first_crossing(c[LINK], edge, step) if edge < math.inf else math.inf
+        at_rectifier = first_crossing(c[LINK], p["v_dc"], step)
+        step = min(step, at_edge, at_rectifier)
+        s["v_dc"] = max(evaluate(c[LINK], step), LEAST_V)
+        if at_edge == step:
+            s["v_dc"], s["braking"] = edge, 1 - s["braking"]
+        elif at_rectifier == step:
+            s["v_dc"] = p["v_dc"]
+        left -= step
+        if left <= 0.0:
+            return
+        shifted(c[POWER], step)

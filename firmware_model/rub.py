@@ -1,0 +1,92 @@
+"""A substep of a shaft that rubs or of a drive whose DC link moves: the series, cut where something changes.
+
+Sliding ends where w reaches 0, which is found on the series; there the shaft sticks when what drives it stays
+within T_s, else it slides on. Sticking ends where the drive exceeds T_s, found on the series of that torque.
+So friction is exact at standstill: w is 0, not small.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from firmware_model.friction import level
+from firmware_model.jit import jit
+from firmware_model.link import advance_link
+from firmware_model.load import load_torque
+from firmware_model.motor import series
+from firmware_model.plant import DRIVE, ORDER, POWER, SLIDE, STRIBECK
+from firmware_model.series import evaluate, first_crossing, within
+
+W_ERROR = 1e-10
+"""Last term of the series of w [rad/s], and of the Stribeck exponential, that a step may have."""
+BREAKS = 1.0 - 1e-12
+"""Share of T_s at which the shaft breaks away: where a series was cut there, rounding may be short of it."""
+PIECES = 1000
+"""Pieces that one substep may have; beyond, it takes what is left in one."""
+
+
+@jit
+def drive_torque(p: Any, s: Any, t: float) -> float:
+    """Torque on the shaft without friction [N m], at t [s]."""
+    x = s["x"]
+    electric = 1.5 * p["n_p"] * (p["psi_f"] + (p["L_d"] - p["L_q"]) * x[2]) * x[1]
+    load = load_torque(p, t, x[0]) + s["T_commanded"]
+    return float(electric - p["B_f"] * x[0] - load + p["J"] * p["phi_w"])
+
+
+@jit
+def friction_torque(p: Any, s: Any, t: float) -> float:
+    """Torque of friction and brakes [N m], positive against positive speed; what holds it at 0."""
+    if not p["rubs"]:
+        return 0.0
+    w, coulomb, extra = s["x"][0], level(p, t), p["static"] - p["coulomb"]
+    if w == 0.0:
+        most = coulomb + extra
+        return float(min(max(drive_torque(p, s, t), -most), most))
+    size = coulomb + extra * math.exp(-abs(w) / p["stribeck"])
+    return float(size if w > 0.0 else -size)
+
+
+@jit
+def slide(p: Any, s: Any, t: float, h: float, most: float, on: bool) -> None:
+    """Compute the series for the way that the shaft slides, or for a shaft that sticks."""
+    w, c = s["x"][0], s["series"]
+    c[SLIDE, 0] = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0)
+    series(p, s["x"], c, t, h, s["u_q"], s["u_d"], s["T_commanded"], on)
+    if p["rubs"] and w == 0.0 and abs(c[DRIVE, 0]) >= most * BREAKS:
+        c[SLIDE, 0] = 1.0 if c[DRIVE, 0] > 0.0 else -1.0
+        series(p, s["x"], c, t, h, s["u_q"], s["u_d"], s["T_commanded"], on)
+
+
+@jit
+def piece(p: Any, c: Any, most: float, left: float) -> float:
+    """How far the series holds: to its accuracy, to where w reaches 0, or to where the drive exceeds T_s."""
+    if c[SLIDE, 0] == 0.0:
+        c[DRIVE, ORDER] = 0.0
+        return min(left, first_crossing(c[DRIVE], most, left), first_crossing(c[DRIVE], -most, left))
+    step = within(c[0], left, W_ERROR)
+    if p["static"] > p["coulomb"]:
+        step = min(within(c[STRIBECK], left, W_ERROR), step)
+    return min(step, first_crossing(c[0], 0.0, step))
+
+
+@jit
+def rub(p: Any, s: Any, t: float, h: float, on: bool) -> None:
+    """Advance motor and DC link from t [s] by h [s]."""
+    x, c, left = s["x"], s["series"], h
+    most = level(p, t + 0.5 * h) + p["static"] - p["coulomb"]
+    for n in range(PIECES):
+        slide(p, s, t, left, most, on)
+        step = piece(p, c, most, left) if p["rubs"] and n < PIECES - 1 else left
+        for k in range(ORDER + 1):
+            c[POWER, k] = 1.5 * (s["u_q"] * c[1, k] + s["u_d"] * c[2, k]) if on else 0.0
+        for i in range(3):
+            x[i] = evaluate(c[i], step)
+        if p["rubs"] and c[SLIDE, 0] * x[0] <= 0.0:
+            x[0] = 0.0
+        if p["capacitance"] > 0.0:
+            advance_link(p, s, c, step)
+        t, left = t + step, left - step
+        if left <= 0.0:
+            return
