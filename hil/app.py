@@ -34,6 +34,7 @@ from hil.config import RunConfig, load_toml
 from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Rights, Words, guardian
+from hil.inbox import Inbox, ranges
 from hil.log.origin import origin, package_version
 from hil.log.recorder import BYTES_PER_TICK, Recorder, check_folder
 from hil.log.split import part_path
@@ -476,16 +477,29 @@ def _recorded(
             if watch:
                 recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
             machine, plan = setup.machine.fresh(), plan_of(config)
+            machine = machine if request.ramps else machine.at_once()
             alone = watch is not None or clock.name != "monotonic"
             whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
-            parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
-            loop = Loop(*parts)
-            client.discard()
-            result = _run_armed(setup, machine, loop, plan, recorder, clock, request, client.odd_length)
+            takes = set_by_others(setup)
+            with contextlib.closing(Inbox(machine, takes)) as inbox:
+                parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
+                loop = Loop(*parts, inbox if takes else None)
+                client.discard()
+                result = _run_armed(
+                    setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length
+                )
     except (LinkError, DriverError, HilError) as error:
         recorder.close({"ended": f"refused: {error}"})
         raise
     return result
+
+
+def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
+    """What ``hil set`` may ask of this run: nothing when the config says so, or when it sends nothing."""
+    config = setup.config
+    if config.loop.shadow or not config.setpoint.enabled:
+        return {}
+    return ranges(setup.machine, config.controller.kind)
 
 
 def _await_drive(setup: Setup, client: DriveClient) -> None:
@@ -532,6 +546,7 @@ def _run_armed(
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
+    takes: dict[str, tuple[float, float, float]],
     odd_length: Callable[[], str],
 ) -> RunResult:
     grants: list[realtime.Grant] = []
@@ -543,9 +558,8 @@ def _run_armed(
                 realtime.keep_off(recorder.writer_pid, setup.config.realtime.cpu)
                 grants = realtime.acquire(setup.config.realtime)
             bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
-            entry = own_entry(
-                recorder.path, f"{bus.interface}:{bus.channel}", rate_hz, plan.ticks, clock.name
-            )
+            where = f"{bus.interface}:{bus.channel}"
+            entry = own_entry(recorder.path, where, rate_hz, plan.ticks, clock.name, takes)
             with announced(entry), watching(os.getpid(), plan.ticks):
                 begin_ns = time.thread_time_ns()
                 outcome = loop.run()

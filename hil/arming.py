@@ -53,8 +53,10 @@ class DeadMan(StopRequest):
     """A stop request that also comes when ``fd`` closes or, on a terminal, no key was seen for a second.
 
     Polled by the loop through :attr:`value`: one system call of no waiting. ``now_ns`` is monotonic; the
-    first poll starts the time.
+    first poll starts the time. What a dead-man's switch stops stops at once, without a ramp.
     """
+
+    ramps = False
 
     def __init__(self, fd: int, now_ns: Callable[[], int], hold_ns: int = HOLD_NS) -> None:
         self._fd, self._now_ns = fd, now_ns

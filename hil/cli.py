@@ -9,9 +9,10 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from hil.commands import (
+    begin,
     bench,
     campaign,
     convert,
@@ -27,15 +28,18 @@ from hil.commands import (
     tuning,
     watch,
 )
+from hil.commands import set as set_
 from hil.commands.common import EXIT_REFUSED, Commands, say
 
 DESCRIPTION = """\
 Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbance observer.
 
   hil demo                     one minute: emulated drive, closed loop, load step, replay
+  hil init DIR                 a configuration with motor, plant and DBC to start from
   hil emulate CONFIG           the emulated drive as a process of its own
   hil run CONFIG               the controller, on the bus that CONFIG names
   hil watch [PID|CHANNEL|LOG]  a running run live: terminal, --web, --foxglove; stops it, too
+  hil set w=60 [RUN]           another reference for a running run, within its range
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
   hil check CONFIG             is all ready for that bus and drive? sends nothing
   hil replay LOG               re-run the controller over a log, compare by bits
@@ -49,12 +53,15 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil campaign PLAN            thousands of cases over all cores: yield, what matters, worst
   hil compare CONFIG           laws tuned by one optimiser to the same limits, side by side
   hil design CONFIG            windows and poles for a motor, its noise and a wish
+  hil completion bash          completion for the shell; also zsh, tcsh
   hil paper                    everything the paper prints and draws, recomputed
 """
 MODULES = (
     demo,
+    begin,
     run,
     watch,
+    set_,
     emulated,
     replay,
     report,
@@ -73,10 +80,24 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="hil", description=DESCRIPTION, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--version", action=_Version, help="print the version and leave")
     commands = Commands(parser)
     for module in MODULES:
         module.register(commands)
     return parser
+
+
+class _Version(argparse.Action):
+    """``--version``: looked up when it is asked for alone."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(nargs=0, **options)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from hil.log.origin import package_version
+
+        print(f"hil {package_version('hil-drive')}")  # noqa: T201
+        parser.exit()
 
 
 def main(argv: list[str] | None = None) -> int:

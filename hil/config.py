@@ -365,6 +365,29 @@ ReferenceTable = Annotated[
 ]
 
 
+class StopTable(Table):
+    """How an orderly stop ends: the speed reference ramps to zero, then the drive is stopped.
+
+    For the first Ctrl-C, SIGTERM, the stop button and the end of ``duration_s``; a second Ctrl-C, a
+    dead-man's switch and every fault stop at once. ``ramp_rad_s2``: 0 stops at once; None takes w_max in a
+    second, at most half of what the motor's torque gives. After ``ramp_max_s`` the drive is stopped anyway.
+    """
+
+    ramp_rad_s2: NonNegative | None = None
+    ramp_max_s: Annotated[float, Field(gt=0, le=60)] = 5.0
+
+
+class SetpointTable(Table):
+    """What ``hil set`` may ask of a running run; None: 0.9 of the limit, at the rate of the stop's ramp."""
+
+    enabled: bool = True
+    w_min_rad_s: Finite | None = None
+    w_max_rad_s: Finite | None = None
+    rate_rad_s2: Positive | None = None
+    i_q_max_a: Positive | None = None
+    i_q_rate_a_s: Positive | None = None
+
+
 class LogTable(Table):
     """Where the log goes."""
 
@@ -428,6 +451,8 @@ class RunConfig(Table):
     limits: LimitsTable
     feedback: FeedbackTable = FeedbackTable()
     reference: ReferenceTable
+    stop: StopTable = StopTable()
+    setpoint: SetpointTable = SetpointTable()
     log: LogTable = LogTable()
     criteria: CriteriaTable = CriteriaTable()
     emulator: EmulatorTable | None = None

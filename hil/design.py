@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -17,8 +17,10 @@ from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
 from hil.guard import MEASURED, MOST_MESSAGES, SAFETY_PARAMS
-from hil.kernel import PLACED, new_safety_state, prepare, step, whole, whole_at
+from hil.kernel import PLACED, new_safety_state, step, whole, whole_at
 from hil.log.named import to_named
+from hil.setpoint import new_setpoint_state, no_setpoint, prepare
+from hil.setpoint_design import setpoint_params
 from hil.signals import TickArray, new_ticks
 
 CYCLIC_ECHO_LAG = 3
@@ -75,10 +77,12 @@ class Machine:
     law: Record
     law_state: Record
     reference: Record
+    setpoint: Record = field(default_factory=no_setpoint)
+    setpoint_state: Record = field(default_factory=new_setpoint_state)
 
     def prepare(self, ticks: TickArray) -> None:
         """Write this tick's reference."""
-        prepare(self.reference, self.safety_state, self.law, ticks)
+        prepare(self.reference, self.setpoint, self.setpoint_state, self.safety_state, self.law, ticks)
 
     def step(self, ticks: TickArray) -> None:
         """Run one tick."""
@@ -94,7 +98,8 @@ class Machine:
         return call
 
     def _records(self) -> tuple[Record, ...]:
-        return self.reference, self.safety, self.safety_state, self.law, self.law_state
+        setpoint = self.setpoint, self.setpoint_state
+        return self.reference, *setpoint, self.safety, self.safety_state, self.law, self.law_state
 
     def places(self) -> npt.NDArray[np.int64]:
         """Where its records are, for :func:`hil.kernel.whole_at`; it must outlive their use."""
@@ -103,7 +108,18 @@ class Machine:
 
     def fresh(self) -> Machine:
         """The same controller before its first tick."""
-        return Machine(self.safety, new_safety_state(), self.law, new_law_state(), self.reference)
+        states = {
+            "safety_state": new_safety_state(),
+            "law_state": new_law_state(),
+            "setpoint_state": new_setpoint_state(),
+        }
+        return replace(self, **states)
+
+    def at_once(self) -> Machine:
+        """The same controller, whose stops are without a ramp."""
+        setpoint = self.setpoint.copy()
+        setpoint["stop_ticks"] = 0
+        return replace(self, setpoint=setpoint)
 
     def to_json(self) -> str:
         """The parameters by name, exact to the bit: a design's exponentials differ between processors."""
@@ -265,4 +281,6 @@ def build(config: RunConfig, wire: WireFacts) -> Machine:
         law,
         new_law_state(),
         reference_record(config.reference),
+        setpoint_params(config),
+        new_setpoint_state(),
     )

@@ -218,6 +218,7 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
         return NOT_BEGUN
     ticks = array_at(table, TICK_AT, TICK)
     t = ticks[0]
+    request = t["request"]
     stamp(t, k, deadline_ns, woken_ns, asked, log_failed)
     stage = read(table, t, deadline_ns)
     mark(marks, READ, times)
@@ -234,7 +235,7 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
     t["sent_ns"] = since(deadline_ns, times)
     mark(marks, SEND, times)
     hand_on(table)
-    if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state:
+    if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state or t["request"] != request:
         return SENT
     push(places_at(table, TICKS_IN), 1)
     t["recorded_ns"] = since(deadline_ns, times)

@@ -13,14 +13,17 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.jit import array_at, jit
-from hil.control.law import FAC, LAW_PARAMS, LAW_STATE, apply, ask, is_saturated, observe, reset, to_circle
-from hil.control.references import REFERENCE, reference_at
+from hil.control.law import LAW_PARAMS, LAW_STATE, apply, ask, is_saturated, observe, reset, to_circle
+from hil.control.references import REFERENCE
 from hil.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
+from hil.setpoint import SETPOINT_PARAMS, SETPOINT_STATE, prepare
 from hil.signals import Controlword, DriveState, GuardFlag, Reason, RxFlag
 from hil.supervisor import begin_stop, supervise
 
 Record = npt.NDArray[np.void]
-PLACED = (REFERENCE, SAFETY_PARAMS, SAFETY_STATE, LAW_PARAMS, LAW_STATE)
+PLACED = (
+    REFERENCE, SETPOINT_PARAMS, SETPOINT_STATE, SAFETY_PARAMS, SAFETY_STATE, LAW_PARAMS, LAW_STATE,
+)  # fmt: skip
 """The records of one controller, in the order in which :func:`whole` takes them."""
 
 __all__ = ["SAFETY_PARAMS", "SAFETY_STATE", "new_safety_state", "prepare", "step"]
@@ -142,24 +145,17 @@ def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
 
 
 @jit
-def prepare(rp: Any, ss: Any, lp: Any, ticks: Any) -> None:
-    """Write the reference of this tick; its time begins when operation is enabled."""
-    t, s = ticks[0], ss[0]
-    w_ref, dw_ref = reference_at(rp[0], s["run_ticks"] * lp[0]["T_s"])
-    t["w_ref"], t["dw_ref"] = w_ref, dw_ref
-    t["i_q_ref_in"] = rp[0]["i_q"] if lp[0]["kind"] == FAC else 0.0
-
-
-@jit
-def whole(rp: Any, sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
-    """:func:`prepare` and :func:`step`: a tick of a loop, which has no logged reference to take."""
-    prepare(rp, ss, lp, ticks)
+def whole(rp: Any, gp: Any, gs: Any, sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
+    """:func:`hil.setpoint.prepare` and :func:`step`: a tick of a loop, whose reference is not logged yet."""
+    prepare(rp, gp, gs, ss, lp, ticks)
     step(sp, ss, lp, ls, ticks)
 
 
 @jit
 def whole_at(places: Any, ticks: Any) -> None:
     """:func:`whole` over the records at ``places``, in the order of :data:`PLACED`."""
-    safety, state = array_at(places, 1, SAFETY_PARAMS), array_at(places, 2, SAFETY_STATE)
-    law, law_state = array_at(places, 3, LAW_PARAMS), array_at(places, 4, LAW_STATE)
-    whole(array_at(places, 0, REFERENCE), safety, state, law, law_state, ticks)
+    profile, limits = array_at(places, 0, REFERENCE), array_at(places, 1, SETPOINT_PARAMS)
+    setpoint = array_at(places, 2, SETPOINT_STATE)
+    safety, state = array_at(places, 3, SAFETY_PARAMS), array_at(places, 4, SAFETY_STATE)
+    law, law_state = array_at(places, 5, LAW_PARAMS), array_at(places, 6, LAW_STATE)
+    whole(profile, limits, setpoint, safety, state, law, law_state, ticks)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from hil.ports import Clock, Drive, Recorder
+from hil.ports import Clock, Drive, Inbox, Recorder
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell
 from hil.trouble import TROUBLE, Trouble
 
@@ -34,8 +34,10 @@ QUEUE_MOST = 4096
 ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 
 
-STOP, BUS_DOWN, SEND_FAILED = int(Request.STOP), int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
+RAMP_DOWN, STOP = int(Request.RAMP_DOWN), int(Request.STOP)
+BUS_DOWN, SEND_FAILED = int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
 NEVER = 2**63
+RAMP_EVENT = "ramp-down", "a stop was asked: the speed reference ramps to 0"
 
 
 def bounded(ns: int) -> int:
@@ -46,6 +48,8 @@ def bounded(ns: int) -> int:
 class StopRequest:
     """What the operator asks: nothing, a stop (first Ctrl-C, SIGTERM) or a quick stop (second)."""
 
+    ramps = True
+    """Whether a stop lets the reference ramp to 0 first, as the config says."""
     STOPS = (int(Request.STOP), int(Request.QUICK_STOP))
 
     def __init__(self) -> None:
@@ -139,6 +143,7 @@ class Loop:
         plan: Plan,
         request: StopRequest,
         whole: Callable[[], Whole] = no_whole,
+        inbox: Inbox | None = None,
     ) -> None:
         self._drive, self._clock, self._recorder = drive, clock, recorder
         self._step, self._ticks, self._plan, self._request = step, ticks, plan, request
@@ -146,8 +151,11 @@ class Loop:
         self._sends_sync = plan.pacing == "sync"
         self._cells: Any = Cells(ticks)
         self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
-        self._arrived_ns = 0
+        self._arrived_ns = self._start_ns = 0
+        self._inbox, self._taken = inbox, 0
+        self._number: Any = inbox.number if inbox else [0]
         self._state = int(DriveState.SWITCH_ON_DISABLED)
+        self._requested = int(Request.ARM)
         self._tick: Any = ticks[0]
         drive.prepare(self._tick)
         self._whole = whole()
@@ -164,7 +172,7 @@ class Loop:
     def _run(self) -> None:
         outcome, period_ns, recorder = self._outcome, self._plan.period_ns, self._recorder
         tick, whole, compiled = self._tick, self._whole, self._whole is not none_compiled
-        start_ns = self._clock.now_ns()
+        start_ns = self._start_ns = self._clock.now_ns()
         k = 0
         while True:
             deadline_ns = start_ns + k * period_ns
@@ -179,7 +187,18 @@ class Loop:
     def _asked(self, k: int) -> int:
         """What is asked of the supervisor; at the end of the run a stop, at least."""
         asked = self._request.value
-        return asked if k < self._end else max(STOP, asked)
+        if k >= self._end:
+            asked = max(STOP, asked)
+        if self._number[0] != self._taken:
+            self._take(k, asked)
+        return asked
+
+    def _take(self, k: int, asked: int) -> None:
+        """A set-point of another process, into the reference of this tick or refused."""
+        assert self._inbox is not None  # noqa: S101 - without one the number stays 0
+        if text := self._inbox.take(self._cells.state[0], asked):
+            self._taken = self._number[0]
+            self._recorder.event(self._start_ns + k * self._plan.period_ns, k, "set-point", text)
 
     def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> int:
         """What is left of a tick that got to ``stage``; return k, which may have moved on."""
@@ -246,6 +265,10 @@ class Loop:
         if t.state[0] != self._state:
             self._state = t.state[0]
             self._recorder.event(deadline_ns, k, *transition_event(self._state, t.reason[0]))
+        if t.request[0] != self._requested:
+            self._requested = t.request[0]
+            if self._requested == RAMP_DOWN:
+                self._recorder.event(deadline_ns, k, *RAMP_EVENT)
         self._recorder.tick(self._ticks)
         t.recorded_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
         if t.reason[0]:

@@ -65,3 +65,12 @@ class Recorder(Protocol):
 
     def event(self, t_ns: int, k: int, kind: str, text: str) -> None:
         """Store one event."""
+
+
+class Inbox(Protocol):
+    """Where another process leaves set-points. The loop looks at ``number`` alone until it is another one."""
+
+    number: Any
+
+    def take(self, state: int, asked: int) -> str:
+        """Judge what waits, for a supervisor in ``state`` and a Request; the event's text, or nothing yet."""

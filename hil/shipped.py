@@ -21,6 +21,14 @@ def find_config(name: str) -> Path:
     raise HilError(f"configs/{name}: not found; run from the project's folder or pass a configuration")
 
 
+def find_shipped(name: str) -> Path:
+    """A configuration as it was shipped, whatever the working directory holds. Raises HilError."""
+    for folder in (SOURCE_TREE, INSTALLED):
+        if (folder / name).is_file():
+            return folder / name
+    raise HilError(f"{name}: is not in the installation; install hil-drive anew")
+
+
 def log_base(config: Path) -> Path:
     """Folder that a config's ``log.folder`` is relative to: its own; an installed one's is ./configs."""
     return Path.cwd() / "configs" if config.is_relative_to(INSTALLED) else config.parent

@@ -52,7 +52,8 @@ class Request(IntEnum):
 
     NONE = 0
     ARM = 1
-    RUN = 2
+    RAMP_DOWN = 2
+    """A stop that was asked for, while the reference still ramps to 0: see :mod:`hil.setpoint`."""
     STOP = 3
     QUICK_STOP = 4
 

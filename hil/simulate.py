@@ -25,14 +25,15 @@ from hil.control.law import FAC
 from hil.design import Machine
 from hil.emulate import load_plant
 from hil.errors import ConfigError
-from hil.kernel import prepare, step
+from hil.kernel import step
 from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
 from hil.log.split import SplitFile, open_run
-from hil.loop import transition_event
+from hil.loop import RAMP_EVENT, transition_event
 from hil.reasons import explain
 from hil.report.segments import Responses
 from hil.report.statistics import Totals
+from hil.setpoint import prepare
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.snapshot import StateFollower
 
@@ -83,6 +84,8 @@ def simulate_block(
     lp: Any,
     ls: Any,
     rp: Any,
+    gp: Any,
+    gs: Any,
     pp: Any,
     ps: Any,
     out: Any,
@@ -102,7 +105,7 @@ def simulate_block(
         t["gap"] = 1
         t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
         receive(pp, ps, out, t)
-        prepare(rp, ss, lp, tick)
+        prepare(rp, gp, gs, ss, lp, tick)
         step(sp, ss, lp, ls, tick)
         deliver(lp, ps, t)
         ticks[j] = tick[0]
@@ -144,6 +147,7 @@ class Simulation:
         def into(ticks: TickArray, k: int) -> int:
             return simulate_block(
                 machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
+                machine.setpoint, machine.setpoint_state,
                 self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
             )  # fmt: skip
 
@@ -219,6 +223,11 @@ def simulate(
     }
 
 
+def changes(values: npt.NDArray[np.uint32], before: int) -> npt.NDArray[np.intp]:
+    """Where a value is not the one before it."""
+    return np.nonzero(np.diff(values.astype(np.int64), prepend=before))[0]
+
+
 class Figures:
     """What a run achieved, by the report's rules, block by block; ``seconds``: what that took."""
 
@@ -255,14 +264,18 @@ def _through(
     Returns the last tick, how many there were, and the first with a reason, None for none.
     """
     last, count, state, stop = new_ticks()[0], 0, int(DriveState.SWITCH_ON_DISABLED), None
+    request = 0
     for ticks in simulation.blocks():
         if file:
-            for row in np.nonzero(np.diff(ticks["state"].astype(np.int64), prepend=state))[0]:
+            for row in changes(ticks["state"], state):
                 t = ticks[row]
                 event = transition_event(int(t["state"]), int(t["reason"]))
                 file.add_event(int(t["t_ns"]), int(t["k"]), *event)
+            for t in ticks[changes(ticks["request"], request)]:
+                if t["request"] == Request.RAMP_DOWN:
+                    file.add_event(int(t["t_ns"]), int(t["k"]), *RAMP_EVENT)
             file.add_ticks(ticks)
-        state = int(ticks["state"][-1])
+        state, request = int(ticks["state"][-1]), int(ticks["request"][-1])
         last, count = ticks[-1].copy(), count + len(ticks)
         figures.feed(ticks)
         if stop is None and last["reason"]:

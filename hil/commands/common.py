@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -40,6 +41,7 @@ class Commands:
     """The subcommands of ``hil``; each module of this package adds its own."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:
+        self.parser = parser
         self._commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def add(self, name: str, run: Run, text: str) -> argparse.ArgumentParser:
@@ -146,14 +148,20 @@ def output_folder(path: Path) -> Path:
 
 
 def print_json(value: Any) -> None:
-    """Print ``value`` as JSON on standard output."""
+    """Print ``value`` as JSON on standard output; its names are in lower snake case."""
     print(json.dumps(_finite(value), indent=2, allow_nan=False))  # noqa: T201
+
+
+def _snake(key: Any) -> Any:
+    """A name in lower snake case (T_L_hat: t_l_hat); what is no name, a config key or a path, stays."""
+    is_name = isinstance(key, str) and re.fullmatch(r"[A-Za-z][\w-]*", key)
+    return key.lower().replace("-", "_") if is_name else key
 
 
 def _finite(value: Any) -> Any:
     """JSON has no NaN and no infinity: they become null."""
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {_snake(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_finite(item) for item in value]
     if isinstance(value, float) and (value != value or value in (float("inf"), float("-inf"))):

@@ -28,7 +28,7 @@ FAR_NS: Final = 2**62
 READINGS_MOST: Final = 64
 UNLIKELY_GAPS: Final = 6
 """Gaps that are tried with a reading that is not the likely one."""
-STOPS: Final = (Request.STOP, Request.QUICK_STOP)
+STOPS: Final = (Request.RAMP_DOWN, Request.STOP, Request.QUICK_STOP)
 
 
 class Reading(NamedTuple):
@@ -113,7 +113,8 @@ class Run:
         self._watch = CommandWatch(setup.binding) if self.shadow else None
         self._drive = ShadowDrive(self._client, self._watch.applied) if self._watch else self._client
         self._machine, self.ticks = setup.machine.fresh(), new_ticks()
-        records = self._machine.safety_state, self._machine.law_state, self.ticks
+        machine = self._machine
+        records = machine.safety_state, machine.law_state, machine.setpoint_state, self.ticks
         self._records = [record.view(np.uint8) for record in records]
         self._tick = self.ticks[0]  # one object for all: the client binds itself to it
         self._drive.prepare(self._tick)
@@ -243,8 +244,11 @@ class Run:
         return around(likely, least, most)
 
     def _step(self, period: Period, gap: int, request: int) -> None:
-        self.ticks["gap"], self.ticks["request"] = gap, request
+        orderly = request == Request.RAMP_DOWN
+        self.ticks["gap"], self.ticks["request"] = gap, int(Request.STOP if orderly else Request.ARM)
         self._machine.prepare(self.ticks)
+        if not orderly:
+            self.ticks["request"] = request
         self._machine.step(self.ticks)
         if self._watch is not None:
             for frame in period.commands:

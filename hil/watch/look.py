@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from hil.clock import RealClock
+from hil.inbox import SetpointError, ask, outside, shown
 from hil.log.errors import LogError
 from hil.log.info import info
 from hil.log.records import EVENT, EVENT_BYTES
@@ -95,10 +96,20 @@ class Look:
     def stop(self, who: str) -> str:
         """Ask for an orderly stop; say in a few words what came of it."""
         newest = self.latest(1)
-        if len(newest) and int(newest["request"][-1]) >= Request.STOP:
+        if len(newest) and int(newest["request"][-1]) >= Request.RAMP_DOWN:
             return "stopping already"
         t_ns, k = (int(newest[name][-1]) for name in ("t_ns", "k")) if len(newest) else (0, 0)
         return "stop asked" if ask_stop(self.entry, who, t_ns, k) else "asked already, or ended"
+
+    def set(self, values: dict[str, float], who: str) -> str:
+        """Ask for other references; say in a few words what came of it."""
+        if why := outside(values, self.entry.takes):
+            return f"refused: {why}"
+        try:
+            ask(self.entry.pid, values, who, timeout_s=0.5)
+        except SetpointError as error:
+            return f"refused: {error}"
+        return f"set: {shown(values)}"
 
     def close(self) -> None:
         """Let go of the rings."""

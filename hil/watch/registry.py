@@ -10,19 +10,16 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import secrets
 import signal
 import stat
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from hil.clock import RealClock
 from hil.errors import HilError
-
-TOKEN_BYTES: Final = 32
 
 
 class WatchError(HilError, RuntimeError):
@@ -40,6 +37,8 @@ class Entry:
     rate_hz: int
     ticks: int | None = None
     clock: str = "monotonic"
+    takes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """What ``hil set`` may ask, by name: least, most, rate [SI]."""
 
     def __str__(self) -> str:
         return f"PID {self.pid} on {self.bus}, log {self.log}"
@@ -111,23 +110,17 @@ def _write_new(path: Path, value: Any) -> None:
         Path(name).unlink()
 
 
-def secret() -> str:
-    """This user's token for pages on this machine; it stays, so that an open page finds a new server."""
-    path = folder() / "web.token"
-    with contextlib.suppress(FileExistsError):
-        _write_new(path, secrets.token_urlsafe(TOKEN_BYTES))
-    try:
-        token = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise WatchError(f"{path}: can't be read ({error}); remove it") from error
-    if not isinstance(token, str) or len(token) < TOKEN_BYTES:
-        raise WatchError(f"{path}: holds no token; remove it")
-    return token
-
-
-def own_entry(log: Path, bus: str, rate_hz: int, ticks: int | None, clock: str = RealClock.name) -> Entry:
+def own_entry(
+    log: Path,
+    bus: str,
+    rate_hz: int,
+    ticks: int | None,
+    clock: str = RealClock.name,
+    takes: dict[str, tuple[float, float, float]] | None = None,
+) -> Entry:
     """The entry of this process; ``clock``: the name of its loop's."""
-    return Entry(os.getpid(), start_time(os.getpid()) or 0, str(log), bus, rate_hz, ticks, clock)
+    start = start_time(os.getpid()) or 0
+    return Entry(os.getpid(), start, str(log), bus, rate_hz, ticks, clock, takes or {})
 
 
 @contextlib.contextmanager

@@ -1,9 +1,9 @@
 """A page on 127.0.0.1 that shows a run live and can stop it. A process of its own beside the run.
 
 Only this machine reaches it, and of its users only who knows the address: that begins with a random token,
-kept in a file that only this user can read. Requests that name another host (DNS rebinding) and sockets that
-another page opened are refused. A viewer that reads slowly misses messages: for each there is only the newest
-waiting, never a queue.
+a new one each start, so that an old page has nothing to give to whoever takes the port next. Requests
+that name another host (DNS rebinding) and sockets that another page opened are refused. A viewer that reads
+slowly misses messages: for each there is only the newest waiting, never a queue.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import asyncio
 import hmac
 import json
 import os
+import secrets
 from collections.abc import Callable
 from http import HTTPStatus
 from importlib.resources import files
@@ -23,9 +24,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from hil.watch.feed import Feed
-from hil.watch.registry import WatchError, secret
+from hil.watch.registry import WatchError
 
 PERIOD_S: Final = 0.1
+TOKEN_BYTES: Final = 32
 MAX_VIEWERS: Final = 50
 MAX_MESSAGE: Final = 1024
 POLICY: Final = (
@@ -52,7 +54,7 @@ class Web:
 
     def __init__(self, wanted: str | None, port: int) -> None:
         self._feed = Feed(wanted)
-        self._token = secret()
+        self._token = secrets.token_urlsafe(TOKEN_BYTES)
         self.port = port
         self._viewers: dict[ServerConnection, Viewer] = {}
 
@@ -105,19 +107,21 @@ class Web:
             del self._viewers[connection]
 
     def _asked(self, message: str | bytes, connection: ServerConnection) -> str:
-        """Carry out what a viewer asked; what to tell it."""
+        """Carry out what a viewer asked, ``{"stop": token}`` or ``{"set": {"w": 60}, "token": token}``."""
         try:
             asked = json.loads(message)
-            token = str(asked["stop"])
-        except (ValueError, KeyError, TypeError):
+            token = str(asked["token"] if "set" in asked else asked["stop"])
+            values = {str(name): float(value) for name, value in dict(asked.get("set", {})).items()}
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
             return "not understood"
         if not self._is_token(token):
             return "refused: not the token of this page"
         look = self._feed.look
         if look is None:
-            return "there is no run to stop"
+            return "there is no run to set" if "set" in asked else "there is no run to stop"
         host, port = connection.remote_address[:2]
-        return look.stop(f"stop button of hil watch --web, from {host} port {port}, user id {os.getuid()}")
+        who = f"hil watch --web, from {host} port {port}, user id {os.getuid()}"
+        return look.set(values, who) if "set" in asked else look.stop(f"stop button of {who}")
 
     async def feed(self) -> None:
         """Hand new messages to every viewer, for ever."""

@@ -183,7 +183,7 @@ def with_line(rows: list[str], body: str, at: int = 300) -> list[str]:
 BAD: dict[str, tuple[Edit, str]] = {
     "no feedback": (lambda rows: [row for row in rows if " 181#" not in row], "no valid feedback.*181"),
     "other identifiers": (lambda rows: [row.replace(" 080#", " 090#") for row in rows], "SYNC 80; seen:.*90"),
-    "time goes back": (lambda rows: rows[300:] + rows[:300], "time goes back by 1.0"),
+    "time goes back": (lambda rows: rows[300:] + rows[:300], "time goes back by 1.5"),
     "two channels": (lambda rows: [*rows[:50], *(r.replace("can0", "can1") for r in rows[50:])], "--channel"),
     "an hour later": (lambda rows: later(rows, 3600), "time jumps by 3600.*cut it there"),
     "50 days later": (lambda rows: later(rows, 50 * 86400), "time jumps by 4320000"),

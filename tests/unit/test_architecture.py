@@ -73,7 +73,14 @@ def test_only_the_composition_root_knows_drivers_and_the_emulator(path: Path) ->
 def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
     own = starts(imports(ROOT / "hil" / f"{name}.py"), "hil")
     assert own <= starts(
-        own, "hil.ports", "hil.signals", "hil.control", "hil.guard", "hil.supervisor", "hil.trouble"
+        own,
+        "hil.ports",
+        "hil.signals",
+        "hil.control",
+        "hil.guard",
+        "hil.supervisor",
+        "hil.setpoint",
+        "hil.trouble",
     )
 
 

@@ -89,7 +89,7 @@ def bench() -> Bench:
 
 
 def test_nothing_is_sent_before_arming(bench: Bench) -> None:
-    for request in (Request.NONE, Request.RUN, Request.STOP, Request.QUICK_STOP):
+    for request in (Request.NONE, Request.RAMP_DOWN, Request.STOP, Request.QUICK_STOP):
         t = bench.step(request=int(request))
         assert (t["send"], t["state"]) == (0, DriveState.SWITCH_ON_DISABLED)
 
