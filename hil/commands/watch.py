@@ -8,6 +8,10 @@ import contextlib
 from hil.commands.common import Commands, print_json, say
 
 WEB_PORT, FOXGLOVE_PORT = 8080, 8765
+OPEN = (
+    "--foxglove: that protocol has no password, so every program of this machine, other users' too, and "
+    "every web page open here could read the run; say --open beside it where that is fine"
+)
 
 
 def register(commands: Commands) -> None:
@@ -26,6 +30,12 @@ def register(commands: Commands) -> None:
         "--foxglove", action="store_true", help="serve Foxglove, Lichtblick and PlotJuggler on 127.0.0.1"
     )
 
+    command.add_argument(
+        "--open",
+        action="store_true",
+        help="with --foxglove, whose protocol has no password: let every program and page here read the run",
+    )
+
 
 def _port(text: str) -> int:
     """A TCP port."""
@@ -39,7 +49,7 @@ def cmd_watch(args: argparse.Namespace) -> int:
     """Watch a run."""
     from hil.watch import terminal
     from hil.watch.look import Look, figures
-    from hil.watch.registry import choose
+    from hil.watch.registry import WatchError, choose
 
     if args.web:
         from hil.watch import web
@@ -49,6 +59,8 @@ def cmd_watch(args: argparse.Namespace) -> int:
     if args.foxglove:
         from hil.watch import stream
 
+        if not args.open:
+            raise WatchError(OPEN)
         stream.run(args.run_name, FOXGLOVE_PORT if args.port is None else args.port, say)
         return 0
     look = Look(choose(args.run_name))

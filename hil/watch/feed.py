@@ -88,7 +88,7 @@ class Feed:
         entry = found[0]
         run = {"pid": entry.pid, "bus": entry.bus, "log": entry.log, "rate_hz": entry.rate_hz}
         self._said = ""
-        self.opening = [json.dumps({"run": run | {"ticks": entry.ticks}})]
+        self.opening = [json.dumps({"run": run | {"ticks": entry.ticks, "takes": entry.takes}})]
         return list(self.opening)
 
     def _status(self, text: str) -> list[str]:

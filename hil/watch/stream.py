@@ -1,7 +1,8 @@
 """A run over Foxglove's WebSocket protocol, for Foxglove, Lichtblick, PlotJuggler; extra `foxglove`.
 
 Topics, schemas and messages are those of the MCAP files, so one layout serves both; times are the log's.
-Only this machine reaches it, and nothing that a client sends reaches the run.
+Only this machine reaches it, and nothing that a client sends reaches the run. The protocol has no password,
+so any program and any web page of this machine can read: ``hil watch`` asks for ``--open``.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""The live page beside a real run in a real browser: plots move, the stop button stops, it comes back."""
+"""The live page beside a real run in a real browser: plots move, it sets, the stop button stops."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
+import socket
 import subprocess
 import sys
 import urllib.error
@@ -27,6 +28,7 @@ from tests.process.test_watch import wait_for_run
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
+SET = "document.querySelector('#w').value = {}, document.querySelector('#set').click()"
 LAST = "Number(document.body.dataset.last)"
 
 
@@ -68,10 +70,10 @@ def port_of(url: str) -> str:
 
 async def say(url: str, message: str, origin: str | None = None) -> str:
     """What the server notes to a message over a socket of its own."""
-    async with connect(url.replace("http", "ws") + "live", origin=origin, proxy=None) as socket:  # type: ignore[arg-type]
-        await socket.send(message)
+    async with connect(url.replace("http", "ws") + "live", origin=origin, proxy=None) as live:  # type: ignore[arg-type]
+        await live.send(message)
         while True:
-            answer = json.loads(await asyncio.wait_for(socket.recv(), 30))
+            answer = json.loads(await asyncio.wait_for(live.recv(), 30))
             if "note" in answer:
                 return str(answer["note"])
 
@@ -101,6 +103,17 @@ def test_strangers_are_refused() -> None:
                 asyncio.run(say(address, "{}", origin=origin))
         for message in ('{"stop": "guess"}', '{"stop": null}', '{"stop": "é"}', '{"stop": "\\ud800"}'):
             assert asyncio.run(say(url, message)).startswith("refused")
+        for message in ('{"set": {"w": 1}, "token": "guess"}', '{"set": {}, "token": null}'):
+            assert asyncio.run(say(url, message)).startswith("refused")
+        for message in (
+            '{"set": {"w": 1}}',
+            '{"set": 3, "token": ""}',
+            '{"set": {"w": "fast"}, "token": ""}',
+        ):
+            assert asyncio.run(say(url, message)) == "not understood"
+        assert (
+            asyncio.run(say(url, json.dumps({"set": {"w": 1}, "token": token}))) == "there is no run to set"
+        )
         for message in ("", "[]", "{", "3", '"stop"', "{}"):
             assert asyncio.run(say(url, message)) == "not understood"
         with urllib.request.urlopen(url, timeout=30) as page:
@@ -111,18 +124,27 @@ def test_strangers_are_refused() -> None:
         assert taken.returncode == 2 and "choose another: --port" in taken.stderr
 
 
-def test_the_token_is_this_users_and_a_damaged_one_is_refused(tmp_path: Path) -> None:
+def test_each_start_has_a_token_of_its_own_and_leaves_none(tmp_path: Path) -> None:
     with server("--port", "0") as first, server("--port", "0") as second:
-        assert first[-44:] == second[-44:]
-    path = tmp_path / "hil" / "web.token"
-    assert path.stat().st_mode & 0o777 == 0o600
-    for text in ('""', "", "[]"):
-        path.write_text(text)
-        refused = call("watch", "--web", "--port", "0")
-        assert refused.returncode == 2 and "remove it" in refused.stderr
-    path.unlink()
-    with server("--port", "0") as third:
-        assert third[-44:] != first[-44:]
+        assert first[-44:] != second[-44:]
+        assert status(f"http://127.0.0.1:{port_of(first)}/{second[-44:]}") == 403
+    with server("--port", port_of(first)) as third:
+        assert third[-44:] != first[-44:] and status(first) == 403
+    assert not [path for path in tmp_path.rglob("*") if "token" in path.name]
+
+
+@pytest.mark.parametrize(
+    "twice", ["Host: 127.0.0.1:{port}", "Host: evil.example", "Origin: http://127.0.0.1:{port}"]
+)
+def test_headers_that_come_twice_are_refused(twice: str) -> None:
+    with server("--port", "0") as url:
+        port = port_of(url)
+        live = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        head = f"GET {url[-45:]}live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n{live}"
+        head += f"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nOrigin: http://127.0.0.1:{port}\r\n"
+        with socket.create_connection(("127.0.0.1", int(port)), timeout=30) as stranger:
+            stranger.sendall(f"{head}{twice.format(port=port)}\r\n\r\n".encode())
+            assert stranger.recv(100).startswith(b"HTTP/1.1 403 ")
 
 
 def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
@@ -144,6 +166,15 @@ def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
                     "[...['className', 'textContent']].map(k => document.querySelector('#state')[k])"
                 )
                 assert state == ["good", "operation enabled"]
+            pages[1].evaluate(
+                "document.querySelector('#w').value = 42, document.querySelector('#set').click()"
+            )
+            note = "document.querySelector('#note').textContent"
+            pages[1].wait_for(f"{note} === 'set: w = 42 rad/s'")
+            pages[1].evaluate(
+                "document.querySelector('#w').value = 420, document.querySelector('#set').click()"
+            )
+            pages[1].wait_for(f"{note}.includes('out of range: -135 to 135')")
             pages[0].click("#stop")
             process.communicate(timeout=60)
             assert process.returncode == 0
@@ -156,19 +187,18 @@ def test_plots_move_for_two_viewers_and_the_button_stops_the_run(
     assert log.ticks["state"][-1] == DriveState.SWITCH_ON_DISABLED
     asked = [event["text"] for event in log.events if event["kind"] == "stop-asked"]
     assert len(asked) == 1 and "stop button" in asked[0]
+    taken = [event["text"] for event in log.events if event["kind"] == "set-point"]
+    assert len(taken) == 1 and taken[0].startswith("w = 42 rad/s: taken, asked by hil watch --web")
 
 
-def test_the_page_comes_back_after_the_server_and_says_when_it_is_anothers(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_a_page_whose_server_has_gone_asks_nobody(browser: Browser) -> None:
+    """Whoever takes the port next hears nothing of the page, so its token is in nobody's hands."""
     page, state = browser.page(), "document.querySelector('#state').textContent"
     with server("--port", "0") as url:
         page.open(url)
         page.wait_for(f"{state} === 'waiting for a run'")
-    page.wait_for(f"{state}.startsWith('no connection')")
-    with server("--port", port_of(url)):
-        page.wait_for(f"{state} === 'waiting for a run'")
-    page.wait_for(f"{state}.startsWith('no connection')")
-    (tmp_path / "hil" / "web.token").unlink()
-    with server("--port", port_of(url)):
-        page.wait_for(f"{state}.startsWith('another hil watch serves this port')")
+    with socket.create_server(("127.0.0.1", int(port_of(url)))) as thief:
+        page.wait_for(f"{state}.startsWith('the connection has ended')")
+        thief.settimeout(2.5)  # the page used to ask twice a second
+        with pytest.raises(TimeoutError):
+            thief.accept()

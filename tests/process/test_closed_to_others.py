@@ -117,7 +117,7 @@ def test_files_and_shared_memory_are_the_users_alone(bench: Bench) -> None:
     rings = [link for link, what in opened_by(pids) if what.startswith("/memfd:hil-")]
     assert len(rings) >= 6 and all(link.stat().st_mode & OTHERS == 0 for link in rings)
     running = set(bench.files())
-    assert {path.name for path in running} >= {f"{bench.processes['run'].pid}.json", "web.token"}
+    assert {path.name for path in running} >= {f"{bench.processes['run'].pid}.json"}
     assert_closed(running)
     bench.end(bench.processes["run"])
     bench.end(web)
@@ -168,7 +168,7 @@ def address(column: str) -> IPv4Address:
 def test_sockets_are_of_this_machine_alone(bench: Bench) -> None:
     until(bench.start("watch", "--web", "--port", "0"), "http://")
     web = bench.processes.pop("watch")
-    until(bench.start("watch", "--foxglove", "--port", "0"), "ws://")
+    until(bench.start("watch", "--foxglove", "--open", "--port", "0"), "ws://")
     bench.processes["web"] = web
     own = sockets_of(bench.family())
     tcp = [row for row in rows("tcp") if row[9] in own]
@@ -183,16 +183,17 @@ def test_sockets_are_of_this_machine_alone(bench: Bench) -> None:
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to start a process of another user")
 def test_another_user_gets_nowhere(bench: Bench) -> None:
-    """The same, tried: another user reads no log, no ring, no token, and can't stop the run."""
+    """The same, tried: another user reads no log, no ring, sets nothing, and can't stop the run."""
     until(bench.start("watch", "--web", "--port", "0"), "http://")
     run = bench.processes["run"]
     for path in (bench.folder, *bench.folder.parents):  # the way there is open, as in /tmp
         open_for_now(bench, path)
     log = only_log(bench.folder / "made" / "deep")
-    token = next(path for path in bench.files() if path.name == "web.token")
+    entry = next(path for path in bench.files() if path.name == f"{run.pid}.json")
     ring = next(link for link, what in opened_by([run.pid]) if what.startswith("/memfd:hil-ticks"))
-    assert all(refused("head", "-c1", str(path)) for path in (log, token, ring))
-    assert all(refused("ls", str(path.parent)) for path in (log, token, ring))
+    page = next(link for link, what in opened_by([run.pid]) if what.startswith("/memfd:hil-setpoint"))
+    assert all(refused("head", "-c1", str(path)) for path in (log, entry, ring, page))
+    assert all(refused("ls", str(path.parent)) for path in (log, entry, ring, page))
     assert refused("sh", "-c", f"kill -TERM {run.pid}") and run.poll() is None
     assert not refused("ls", str(bench.folder)), "what is open is reached"
 

@@ -23,7 +23,7 @@ from hil.demo import emulator_process
 from hil.log.schema import TOPICS, file_descriptor_set
 from hil.signals import TICK, DriveState, ticks_from
 from tests.node import has_packages, node
-from tests.process.test_run import flags, hil
+from tests.process.test_run import call, flags, hil
 from tests.process.test_watch import wait_for_run
 
 Settings = Callable[..., tuple[str, ...]]
@@ -96,7 +96,7 @@ def test_a_client_gets_the_schemas_and_ticks_of_the_log_files(
     own, path = settings("loop.duration_s=60.0"), configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
         wait_for_run(process, channel)
-        with hil("watch", "--foxglove", "--port", "0", channel) as server:
+        with hil("watch", "--foxglove", "--open", "--port", "0", channel) as server:
             assert server.stderr is not None
             found = re.search(r"ws://127\.0\.0\.1:\d+", line := server.stderr.readline())
             assert found, line
@@ -128,7 +128,7 @@ def test_without_the_extra_it_is_one_clear_line() -> None:
         "import sys; sys.modules['foxglove'] = None; from hil.cli import main; sys.exit(main(sys.argv[1:]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script, "watch", "--foxglove"],
+        [sys.executable, "-c", script, "watch", "--foxglove", "--open"],
         capture_output=True,
         text=True,
         timeout=60,
@@ -136,3 +136,9 @@ def test_without_the_extra_it_is_one_clear_line() -> None:
     )
     assert done.returncode == 2
     assert done.stderr == "hil: foxglove-sdk is not installed: pip install 'hil-drive[foxglove]'\n"
+
+
+def test_a_port_without_a_password_is_opened_by_a_flag_alone() -> None:
+    done = call("watch", "--foxglove")
+    assert done.returncode == 2 and "say --open beside it" in done.stderr
+    assert len(done.stderr.splitlines()) == 1

@@ -1,7 +1,8 @@
 "use strict";
-// Live plots of a run from the WebSocket beside this page. Comes back by itself when the server or run does.
+// Live plots of a run from the WebSocket beside this page. The next run comes by itself; the next server has
+// another address: nothing is asked with this one's token once it has gone, since anybody may have its port.
 (() => {
-  const KEPT_S = 30, HEIGHT = 190, RETRY_MS = 500;
+  const KEPT_S = 30, HEIGHT = 190, 
   const PLOTS = [
     ["speed [rad/s]", [["w", "measured"], ["w_ref", "reference"]]],
     ["current [A]", [["i_q", "q"], ["i_q_ref", "q asked"], ["i_d", "d"]]],
@@ -89,6 +90,7 @@
       get("run").textContent = `PID ${message.run.pid} on ${message.run.bus}, log ${message.run.log}`;
       get("note").textContent = "";
       get("stop").disabled = false;
+      takes(message.run.takes?.w);
       draw();
     }
     if (message.status) idle(message.status);
@@ -97,27 +99,34 @@
     if (message.curves) { list(message.events); take(message.curves); }
   }
 
+  function takes(range) {
+    get("setpoint").hidden = !range;
+    if (!range) return;
+    get("w").min = range[0]; get("w").max = range[1];
+    get("w").title = `${range[0]} to ${range[1]} rad/s, at ${range[2]} rad/s²`;
+  }
+
   function idle(text) {
     get("state").textContent = text;
     get("state").className = "";
     get("stop").disabled = true;
+    get("setpoint").hidden = true;
   }
 
   function connect() {
     socket = new WebSocket(`ws://${location.host}/${token}/live`);
     socket.onmessage = event => on(JSON.parse(event.data));
-    socket.onclose = () => { idle("no connection; trying again"); setTimeout(again, RETRY_MS); };
+    socket.onclose = () => idle("the connection has ended: open the address that hil watch --web prints");
   }
 
-  // Ask for the page first, quietly: a socket that can't open would complain on the console each time.
-  async function again() {
-    try {
-      const page = await fetch(location.pathname);
-      if (page.ok) connect();
-      else idle("another hil watch serves this port: open the address that it has printed");
-    } catch { setTimeout(again, RETRY_MS); }
+  function set() {
+    const value = get("w").valueAsNumber;
+    if (socket.readyState !== WebSocket.OPEN || !Number.isFinite(value)) return;
+    socket.send(JSON.stringify({set: {w: value}, token}));
   }
 
+  get("set").onclick = set;
+  get("w").onkeydown = event => { if (event.key === "Enter") set(); };
   get("stop").onclick = () => {
     if (asked || socket.readyState !== WebSocket.OPEN) return;
     asked = true;
