@@ -6,18 +6,23 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hil.design import Machine
 from hil.errors import HilError
-from hil.log.reader import Log, Source, new_log, read_blocks
+from hil.log.reader import Frame, Log, Source, new_log, read_blocks
+from hil.log.schema import FRAME, Records
 from hil.log.split import STATE
 from hil.log.ticks import nothing
 from hil.replay.fold import broken, compare, earliest, refold
 from hil.replay.machine import Logged, logged_machine, restored
 from hil.replay.verdict import Difference, Verdict
 from hil.signals import FIELDS, TickArray
+
+if TYPE_CHECKING:
+    from hil.replay.frames import FrameCheck
 
 NOTHING = {field.name: nothing(field) for field in FIELDS}
 
@@ -52,6 +57,11 @@ class Replay:
     impossible: str = ""
     notes: tuple[str, ...] = ()
     difference: Difference | None = None
+
+    @property
+    def whole(self) -> bool:
+        """True when the whole run is compared."""
+        return self.window == Window()
 
     def feed(self, ticks: TickArray) -> bool:
         """Take the next ticks; False when there is no more to learn."""
@@ -130,18 +140,51 @@ class Replay:
         return Verdict("same", self.compared, None, damage, self.notes)
 
 
-def _run(replay: Replay, blocks: Iterable[TickArray], seen: Callable[[int], None]) -> Verdict:
-    for ticks in blocks:
-        more = replay.feed(ticks)
-        seen(replay.ticks)
-        if not more:
+def _run(replay: Replay, blocks: Iterable[tuple[str, Records]], seen: Callable[[int], None]) -> Verdict:
+    """Through the blocks of a log until there is no more to learn from ticks and frames."""
+    more, frames = True, None
+    for kind, records in blocks:
+        if kind == "ticks" and more:
+            more = replay.feed(records)
+            seen(replay.ticks)
+        if replay.whole and not replay.impossible and len(records) and in_lockstep(replay.log):
+            frames = frames or _frame_check(replay.log)
+            frames.feed(kind, records)
+        if not more and (frames is None or frames.over(replay.difference)):
             break
+    if frames is not None and not replay.why:
+        frames.finish()
+        if frames.difference is not None and complete_frames(replay.log):
+            replay.difference = earliest(frames.difference, replay.difference)
     return replay.verdict()
+
+
+def in_lockstep(log: Log) -> bool:
+    """True where the frames' stamps say for sure which tick each is of; a real clock's are not compared yet."""
+    return log.metadata.get("run", {}).get("clock") == "lockstep"
+
+
+def _frame_check(log: Log) -> FrameCheck:
+    """Loaded for a log with frames alone: the wire's kernels are no part of the controller."""
+    from hil.replay.frames import FrameCheck
+
+    return FrameCheck(log)
+
+
+def complete_frames(log: Log) -> bool:
+    """True where no frame was lost on the way into the log."""
+    return log.damage is None and log.result.get("dropped_frames", 0) == 0 and "ended" in log.result
 
 
 def replay_log(log: Log) -> Verdict:
     """Replay a log that has been read."""
-    return _run(Replay(log), [log.ticks], lambda _: None)
+    return _run(Replay(log), [("ticks", log.ticks), ("frames", frame_records(log.frames))], lambda _: None)
+
+
+def frame_records(frames: Iterable[Frame]) -> Records:
+    """Frames that were read as records of the log."""
+    rows = [(f.t_ns, f.can_id, f.received, len(f.data), list(f.data.ljust(64, b"\0"))) for f in frames]
+    return np.array(rows, FRAME)
 
 
 def tick_blocks(log: Log) -> Iterator[TickArray]:
@@ -160,6 +203,6 @@ def replay(
     """
     try:
         log = new_log(source)
-        return _run(Replay(log, window or Window()), tick_blocks(log), seen or (lambda _: None))
+        return _run(Replay(log, window or Window()), read_blocks(log), seen or (lambda _: None))
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))

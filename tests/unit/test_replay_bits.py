@@ -11,10 +11,14 @@ from hil.app import Overrides, load_setup
 from hil.log.check import first_broken, seal, sums
 from hil.log.mcapfile import RunFile
 from hil.log.reader import Log, open_log
+from hil.log.schema import Records
 from hil.replay import replay, replay_log
+from hil.replay.frames import FrameCheck
+from hil.replay.run import frame_records
 from hil.signals import FIELDS, TickArray, new_ticks
 from hil.simulate import simulate
 from tests.conftest import CONFIGS
+from tests.golden.kept import LOGS
 from tests.logfiles import some_ticks
 
 
@@ -107,3 +111,63 @@ def test_a_record_keeps_its_check_and_gets_one_where_it_has_none() -> None:
     expected = sums(ticks)
     seal(ticks)
     assert ticks["check"].tolist() == [5, int(expected[1]), int(expected[2]), 7]
+
+
+@pytest.fixture(scope="module")
+def on_the_bus() -> Log:
+    return open_log(LOGS / "1a4c819" / "lockstep.mcap")
+
+
+def checked(log: Log, ticks: TickArray, frames: Records) -> FrameCheck:
+    """What the frames say of the ticks."""
+    check = FrameCheck(log)
+    check.feed("ticks", ticks)
+    check.feed("frames", frames)
+    check.finish()
+    assert check.note == ""
+    return check
+
+
+@pytest.mark.parametrize("name", ["lockstep", "lockstep-fac", "fault", "inverter"])
+def test_the_frames_of_a_run_give_its_ticks(name: str) -> None:
+    log = open_log(LOGS / "1a4c819" / f"{name}.mcap")
+    check = checked(log, log.ticks, frame_records(log.frames))
+    assert check.difference is None and check.done_k == int(log.ticks["k"][-1])
+
+
+def test_every_bit_of_a_current_is_found_by_its_frame_in_a_log_of_format_1(on_the_bus: Log) -> None:
+    frames, rng = frame_records(on_the_bus.frames), np.random.default_rng(601)
+    for _ in range(100):  # 600 of 600 were tried
+        row, bit = int(rng.integers(1, len(on_the_bus.ticks))), int(rng.integers(64))
+        name = str(rng.choice(["i_q", "i_d"]))
+        first = checked(on_the_bus, flipped(on_the_bus.ticks, row, name, bit), frames).difference
+        assert first is not None and (first.tick, first.field) == (row, name), (row, name, bit)
+
+
+def test_a_bit_of_a_received_payload_is_found(on_the_bus: Log) -> None:
+    frames, rng = frame_records(on_the_bus.frames), np.random.default_rng(602)
+    measured = np.nonzero((frames["received"] == 1) & np.isin(frames["can_id"], [0x181, 0x281]))[0]
+    first_ns = int(on_the_bus.ticks["t_ns"][1])
+    stamps, last_ns = frames["t_ns"][measured], int(on_the_bus.ticks["t_ns"][-1])
+    measured = measured[(stamps > first_ns) & (stamps < last_ns)]
+    for at in rng.choice(measured, 60):
+        changed = frames.copy()
+        byte, bit = int(rng.integers(changed["size"][at])), int(rng.integers(8))
+        changed["data"][at, byte] ^= 1 << bit
+        first = checked(on_the_bus, on_the_bus.ticks, changed).difference
+        assert first is not None, (int(at), byte, bit)
+
+
+def test_a_changed_frame_is_a_verdict(on_the_bus: Log, tmp_path: Path) -> None:
+    frames, path = frame_records(on_the_bus.frames), tmp_path / "a.mcap"
+    at = int(np.nonzero(frames["can_id"] == 0x181)[0][500])
+    frames["data"][at, 3] ^= 4
+    with RunFile(
+        path, {"metadata": on_the_bus.metadata["run"], "attachments": on_the_bus.attachments}
+    ) as file:
+        file.add_ticks(on_the_bus.ticks)
+        file.add_frames(frames)
+        file.finish(on_the_bus.result)
+    verdict = replay(path)
+    assert verdict.verdict == "differs" and verdict.first_difference is not None
+    assert abs(verdict.first_difference.tick - 500) < 5

@@ -1,0 +1,62 @@
+"""Logged frames read again by the kernels that read the bus: what each tick must have measured."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from drivers.frames import EMERGENCY, FRESH
+from drivers.jit import jit
+from drivers.wire import CLASSIC_BYTES, DATA_AT, FD_BYTES, STATE_RAW, take
+
+
+@jit
+def lay_out(frame: Any, raw: Any) -> int:
+    """A logged frame as it came from the socket; its size there."""
+    can_id, size = int(frame["can_id"]), int(frame["size"])
+    for index in range(4):
+        raw[index] = (can_id >> 8 * index) & 0xFF
+    raw[4] = size
+    for index in range(64):
+        raw[DATA_AT + index] = frame["data"][index]
+    return FD_BYTES if size > 8 else CLASSIC_BYTES
+
+
+@jit
+def refeed(
+    frames: Any, limits: Any, counters: Any, ids: Any, messages: Any, signals: Any, last: Any, state: Any,
+    words: Any, raw: Any, tick: Any, log: Any, error_at: int, rows: Any, flags: Any,
+) -> int:  # fmt: skip
+    """Fill ``rows`` (n, bytes of a tick) and ``flags`` (n) with what n ticks must hold; frames used.
+
+    ``limits``: when each tick was computed, on the frames' clock: what came later is another's. ``ids``: SYNC
+    that the controller sends (-1: none), its command, the drive's emergency (-1: none). ``counters``: of the
+    command of each tick, ``tick``: its bytes before the first.
+    """
+    at = 0
+    for j in range(limits.shape[0]):
+        late, seen, done = ids[0] >= 0, 0, False
+        while at < frames.shape[0] and frames[at]["t_ns"] <= limits[j]:
+            frame = frames[at]
+            can_id = int(frame["can_id"])
+            if not frame["received"]:
+                if can_id == ids[0]:
+                    late, done = False, False
+                    state[0]["got"] = 0
+                elif can_id == ids[1] and j > 0:
+                    state[0]["last_sent"] = counters[j - 1]
+            elif can_id == ids[2] and frame["size"] == 8:
+                code = int(frame["data"][0]) | int(frame["data"][1]) << 8
+                tick[error_at : error_at + 4].view(np.uint32)[0] = code
+                seen |= EMERGENCY if code else 0
+            else:
+                size = lay_out(frame, raw)
+                found = take(raw, messages, signals, last, state, words, tick, log, size, late or done, 0)
+                if found > 0:
+                    seen |= found & (STATE_RAW - 1)
+                    done = done or (ids[0] >= 0 and found & FRESH != 0)
+            at += 1
+        rows[j, :] = tick
+        flags[j] = seen
+    return at
