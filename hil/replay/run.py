@@ -160,7 +160,7 @@ def _run(replay: Replay, blocks: Iterable[tuple[str, Records]], seen: Callable[[
 
 
 def in_lockstep(log: Log) -> bool:
-    """True where the frames' stamps say for sure which tick each is of; a real clock's are not compared yet."""
+    """True where the frames' stamps say surely which tick each is of; a real clock's are not compared yet."""
     return log.metadata.get("run", {}).get("clock") == "lockstep"
 
 
