@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.codec import MAX_DBC_BYTES, Database
+from drivers.codec import Database
+from drivers.dbc import MAX_DBC_BYTES
 from drivers.errors import DatabaseError
 from firmware_model.config import PlantConfig
 from hil.config import MAX_CONFIG_BYTES, RunConfig, load_toml, read_toml
