@@ -1,0 +1,96 @@
+"""Campaigns over real workers: the same rows whatever their number and losses; Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+import hil
+from hil.campaign import store
+from tests.conftest import CONFIGS, ROOT
+
+pytestmark = [pytest.mark.process, pytest.mark.compiled]
+CASES = 48
+PLAN = f"""config = "{CONFIGS / "demo.toml"}"
+samples = {CASES}
+set = ["loop.duration_s=SECONDS"]
+[random]
+"plant:motor.J_kg_m2" = {{ percent = 20 }}
+"""
+
+
+def plan_file(folder: Path, seconds: float = 2.0) -> Path:
+    path = folder / "plan.toml"
+    path.write_text(PLAN.replace("SECONDS", str(seconds)), encoding="utf-8")
+    return path
+
+
+def text_of(folder: Path) -> str:
+    held = store.open_folder(folder)
+    return repr({name: held.columns(name)[name].tolist() for name in held.schema})
+
+
+def started(*words: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "hil.cli", "campaign", *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+
+
+def workers(pid: int) -> list[psutil.Process]:
+    """The processes below one, but for the helpers that count shared memory."""
+    found = psutil.Process(pid).children(recursive=True)
+    return [p for p in found if "resource_tracker" not in " ".join(p.cmdline())]
+
+
+def until(what: str, seconds: float = 240.0) -> Iterator[None]:
+    """Wait for something a busy machine may take long for."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        yield
+        time.sleep(0.05)
+    pytest.fail(f"never: {what}")
+
+
+def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path) -> None:
+    path = plan_file(tmp_path, 12.0)
+    alone = hil.campaign(path, tmp_path / "alone", workers=0)
+    assert alone.cases == CASES
+    process = started(str(path), "-o", str(tmp_path / "lossy"), "--json", "-j", "2")
+    for _ in until("a first part"):
+        if list((tmp_path / "lossy" / "rows").glob("part-*")):
+            break
+        assert process.poll() is None
+    victims = workers(process.pid)
+    assert victims
+    victims[0].send_signal(signal.SIGKILL)
+    out, err = process.communicate(timeout=280)
+    assert process.returncode == 0, err
+    assert json.loads(out)["cases"] == CASES and "Traceback" not in err
+    assert text_of(tmp_path / "lossy") == text_of(tmp_path / "alone")
+
+
+def test_what_is_done_is_kept_and_gone_on_with_and_workers_end(tmp_path: Path) -> None:
+    path, folder = plan_file(tmp_path, 40.0), tmp_path / "out"
+    process = started(str(path), "-o", str(folder), "-j", "1")
+    for _ in until("a first part"):
+        if list((folder / "rows").glob("part-*")):
+            break
+        assert process.poll() is None
+    below = workers(process.pid)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=120)
+    assert "Traceback" not in err
+    assert process.returncode == 130
+    for _ in until("the end of the workers"):
+        if not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in below):
+            break
+    kept = int(store.open_folder(folder).done().sum())
+    assert 0 < kept < CASES
+    assert hil.campaign(path, folder, workers=0, resume=True).cases == CASES
