@@ -24,14 +24,13 @@ NOISE_WITHIN: Final = 0.15
 
 def plants_of(bench: Any) -> dict[str, list[str]]:
     """The plant of the config's file, the believed motor, and every corner of the spread."""
-    believed = corner_settings(replace(bench, spread={"J": 0.0, "psi_f": 0.0, "R_s": 0.0, "L": 0.0}))
     corners = corner_settings(bench)
     m = bench.motor
     exact = (
         f"motor={{R_s_ohm = {m.R_s!r}, L_d_h = {m.L_d!r}, L_q_h = {m.L_q!r}, psi_f_wb = {m.psi_f!r}, "
         f"n_p = {m.n_p}, J_kg_m2 = {m.J!r}, B_f_n_m_s = {m.B_f!r}}}"
     )
-    named = {"as in the plant's file": [], "as believed": believed[0] if believed else [exact]}
+    named = {"as in the plant's file": [], "as believed": [exact]}
     return named | {f"corner {j + 1}": one for j, one in enumerate(corners)}
 
 

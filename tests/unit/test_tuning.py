@@ -211,3 +211,14 @@ def test_a_shaft_makes_the_design_slower() -> None:
     soft = tune(family("ftdob"), bench(shafts=shafts), Limits(0.11, 1.6, 2.3), SPEC, effort=0.2)
     assert soft.feasible and all(quiet(law_of(soft.tables, SPEC, 1e-3), BENCH, plants, 4.0))
     assert soft.verdict.nominal.dip > judge(law_of(FAST, SPEC, 1e-3), BENCH).nominal.dip
+
+
+def test_what_the_shipped_configs_promise() -> None:
+    demo = load_setup(DEMO, Overrides())
+    first, now = (seen_in(simulate_ticks(one), 1e-3) for one in (SETUP, demo))
+    assert now.iae <= 0.55 * first.iae and now.u_noise <= first.u_noise
+    assert judge(demo.machine.law, BENCH).worst.ms <= 1.63
+    plants = [shaft(BENCH.motor, 1e-3, float(f)) for f in np.geomspace(15, 400, 24)]
+    assert all(quiet(demo.machine.law, BENCH, plants, 3.0))
+    rigid_one = load_setup(CONFIGS / "rigid.toml", Overrides())
+    assert seen_in(simulate_ticks(rigid_one), 1e-3).dip < 2.3
