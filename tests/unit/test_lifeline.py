@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import mmap
 import os
 import signal
@@ -126,3 +127,14 @@ def test_a_time_that_has_passed_is_no_wait(passed_ns: int) -> None:
     assert time.monotonic_ns() - begun < FAR_NS
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
+
+
+def test_memory_outlives_a_lock_that_is_never_handed_on() -> None:
+    """Once held, its place is in the thread's list: gone, the next lock would write to it and crash."""
+    for _ in range(3):
+        line = shared()
+        pid = holder(line, lambda: None)
+        assert line.given_up_by(soon(10.0))
+        os.waitpid(pid, 0)
+        del line
+        gc.collect()
