@@ -21,8 +21,8 @@ CLOCK_MONOTONIC, PROCESS_SHARED, ROBUST = 1, 1, 1
 SECOND_NS: Final = 1_000_000_000
 
 _KEPT: Final[list[Any]] = []
-"""The C library links what a thread holds into a list: memory that went while it was held would be written to by
-the next lock that the thread takes. So it never goes: a page for each run."""
+"""The C library links what a thread holds into a list: memory that went while it was held would be written to
+by the next lock that the thread takes. So it never goes: a page for each run."""
 
 
 def end_with(parent: int) -> None:

@@ -131,10 +131,10 @@ def test_a_time_that_has_passed_is_no_wait(passed_ns: int) -> None:
 
 def test_memory_outlives_a_lock_that_is_never_handed_on() -> None:
     """Once held, its place is in the thread's list: gone, the next lock would write to it and crash."""
-    for _ in range(3):
-        line = shared()
-        pid = holder(line, lambda: None)
-        assert line.given_up_by(soon(10.0))
+    lines = [shared(), shared()]
+    for _ in range(2):
+        pid = holder(lines[-1], lambda: None)
+        assert lines[-1].given_up_by(soon(10.0))
         os.waitpid(pid, 0)
-        del line
+        lines.pop()
         gc.collect()
