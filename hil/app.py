@@ -313,6 +313,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
             **{f"version {name}": package_version(name) for name in packages},
         },
         "attachments": attachments,
+        "compression": setup.config.log.compression,
         "split": {"s": setup.config.log.split_s, "mb": setup.config.log.split_mb},
     }
 

@@ -394,6 +394,7 @@ class LogTable(Table):
     folder: str = "../logs"
     name: str | None = None
     frames: bool = True
+    compression: Literal["zstd", "lz4"] = "zstd"
     split_s: Annotated[float, Field(ge=1, le=1e7, allow_inf_nan=False)] | None = None
     split_mb: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)] | None = None
 

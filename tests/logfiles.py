@@ -29,6 +29,7 @@ def some_ticks(count: int, first: int = 0, seed: int = 1) -> TickArray:
     ticks["k"] = np.arange(first, first + count)
     ticks["t_ns"] = ticks["k"] * PERIOD_NS
     ticks["gap"] = 1
+    ticks["check"] += 1  # 0 says that there is none, and the log sets it
     return ticks
 
 

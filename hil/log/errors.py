@@ -11,3 +11,7 @@ class LogError(HilError, OSError):
 
 class DamagedError(ValueError):
     """Bytes that are no valid MCAP; what precedes them is good. The reader turns it into ``Log.damage``."""
+
+
+class UnknownCompressionError(DamagedError):
+    """A chunk in a compression that is not known here; it may be good for another program."""

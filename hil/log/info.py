@@ -2,42 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Footer,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Statistics
 
-from hil.log.container import MAGIC
 from hil.log.errors import DamagedError, LogError
 from hil.log.reader import Log, check_format, read_blocks
-from hil.log.scan import MAX_RECORD, parse, read_record
+from hil.log.scan import parse
+from hil.log.summary import all_indexed, record_at, summary
 from hil.signals import new_ticks
-
-_FOOTER_BYTES: Final = 9 + 20
-_HEAD_BYTES: Final = 9
-_SUMMARY: Final[dict[int, Any]] = {
-    Opcode.CHANNEL: Channel,
-    Opcode.STATISTICS: Statistics,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
-    Opcode.METADATA_INDEX: MetadataIndex,
-    Opcode.SUMMARY_OFFSET: SummaryOffset,
-}
 
 
 @dataclass(slots=True)
@@ -107,7 +84,7 @@ def info(path: Path) -> Info:
     try:
         with path.open("rb") as stream:
             return _from_summary(path, stream)
-    except (DamagedError, McapError, ValueError, EOFError):
+    except DamagedError:
         return _from_blocks(path)
     except OSError as error:
         if isinstance(error, LogError):
@@ -117,15 +94,12 @@ def info(path: Path) -> Info:
 
 def _from_summary(path: Path, stream: IO[bytes]) -> Info:
     size = os.fstat(stream.fileno()).st_size
-    at = size - _FOOTER_BYTES - len(MAGIC)
-    footer = _record_at(stream, at, size)
-    if not isinstance(footer, Footer) or stream.read(len(MAGIC)) != MAGIC:
-        raise DamagedError("there is no footer")
-    if not 0 < footer.summary_start < at or at - footer.summary_start > MAX_RECORD:
-        raise DamagedError("there is no summary")
-    out, topics = Info(path, size), {}
-    counts: dict[int, int] | None = None
-    for record in _wanted(stream, footer, at):
+    out, records = Info(path, size), list(summary(stream, size))
+    if not all_indexed(records):  # what is not counted is not 0, and what is not named is not absent
+        raise DamagedError("the summary does not name all")
+    topics: dict[int, str] = {}
+    counts: dict[int, int] = {}
+    for record in records:
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Statistics):
@@ -134,49 +108,13 @@ def _from_summary(path: Path, stream: IO[bytes]) -> Info:
         elif isinstance(record, AttachmentIndex):
             out.attachments[record.name] = record.data_size
         elif isinstance(record, MetadataIndex):
-            found = _record_at(stream, record.offset, size)
-            if isinstance(found, Metadata):
+            raw = record_at(stream, record.offset, size)
+            if isinstance(found := parse(raw.opcode, raw.content), Metadata):
                 out.metadata[found.name] = dict(found.metadata)
-    if counts is None:  # not counted is not 0
-        raise DamagedError("there are no statistics")
     out.counts = {topic: counts.get(number, 0) for number, topic in topics.items()}
     if "run" not in out.metadata:
         raise LogError(f"{path}: is no log of hil (it has no run metadata)")
     check_format(path, out.metadata["run"])
-    return out
-
-
-def _record_at(stream: IO[bytes], at: int, size: int) -> McapRecord | None:
-    if not 0 < at < size:
-        raise DamagedError("an index points out of the file")
-    stream.seek(at)
-    raw = read_record(stream, at, size)
-    return parse(raw.opcode, raw.content)
-
-
-def _wanted(stream: IO[bytes], footer: Footer, end: int) -> Iterator[Any]:
-    """Records of the summary that say what is in the file; the chunks' own, a few a second, are passed by."""
-    start, offsets = footer.summary_start, footer.summary_offset_start
-    if offsets == 0:  # a writer may leave them out
-        yield from _records(stream, start, end)
-        return
-    for group in _records(stream, offsets, end):
-        if isinstance(group, SummaryOffset) and group.group_opcode in _SUMMARY:
-            if not start <= group.group_start <= offsets - group.group_length:
-                raise DamagedError("an offset points out of the summary")
-            yield from _records(stream, group.group_start, group.group_start + group.group_length)
-
-
-def _records(stream: IO[bytes], start: int, end: int) -> list[Any]:
-    """Records of the kinds in ``_SUMMARY`` between two places."""
-    out, at = [], start
-    stream.seek(start)
-    while at < end:
-        raw = read_record(stream, at, end)
-        at += _HEAD_BYTES + len(raw.content)
-        parser = _SUMMARY.get(raw.opcode)
-        if parser is not None:
-            out.append(parser.read(ReadDataStream(io.BytesIO(raw.content))))
     return out
 
 

@@ -55,7 +55,7 @@ class RunFile:
         """``absent``: fields that the ticks to come do not have, since an older log is copied."""
         self._absent = absent
         self._form = form_of([row for row in OWN if row[1] not in absent])
-        self._out = Container(path)
+        self._out = Container(path, header.get("compression", "zstd"))
         self._limit = chunk_bytes
         self._ticks, self._others = Block(), Block()
         self.ticks = self.frames = 0

@@ -6,6 +6,7 @@ yields. A chunk that is damaged is left out and named, and reading goes on behin
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,10 +20,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
 from hil.log.container import FIXED_BYTES, LIBRARY
-from hil.log.errors import DamagedError, LogError
+from hil.log.errors import DamagedError, LogError, UnknownCompressionError
 from hil.log.layouts import FORMAT
 from hil.log.mcapfile import MESSAGE
-from hil.log.scan import Raw, chunk_content, chunk_rows, parse, parse_attachment, raw_records
+from hil.log.scan import Raw, chunk_content, chunk_rows, gathered, parse, parse_attachment, raw_records
 from hil.log.schema import (
     FRAME_HEAD,
     FRAME_MESSAGE,
@@ -33,6 +34,7 @@ from hil.log.schema import (
     message_layout,
     unpack_event,
 )
+from hil.log.summary import later
 from hil.log.ticks import Ticks, form_of, without
 from hil.signals import TICK, TickArray, new_ticks
 
@@ -142,14 +144,22 @@ class _Pass:
         self._form: Ticks | None = None
         self.ours = self.complete = False
         self.problems: list[str] = []
-        self._messages_seen = 0
+        self.messages_seen = 0
+        self._begun = False
+        self.unreadable = ""
+        """Why no chunk could be read at all."""
 
     def take(self, raw: Raw) -> Iterator[Block]:
         """What a record of the file brings; one that is damaged is named and left out."""
+        if raw.opcode in (Opcode.CHUNK, MESSAGE) and not self._begun:
+            self._begun = True
+            self._look_ahead(raw.offset)
         try:
             if raw.opcode == Opcode.ATTACHMENT:
                 name, data = parse_attachment(raw.content)
                 self.log.attachments[name] = data.decode(errors="replace")
+            elif raw.opcode == MESSAGE:
+                yield from self._chunk(raw.content)
             else:
                 record = parse(raw.opcode, raw.content)
                 if isinstance(record, Chunk):
@@ -159,6 +169,21 @@ class _Pass:
         except DamagedError as error:
             self.problems.append(f"{error} (at byte {raw.offset})")
             self.log.bytes_lost += len(raw.content)
+            if isinstance(error, UnknownCompressionError) and not self.messages_seen:
+                self.unreadable = str(error)
+
+    def _look_ahead(self, at: int) -> None:
+        """Learn what other programs write behind the messages: without it these can't be understood.
+
+        What stands before them goes first; what is damaged is named when the pass comes to it.
+        """
+        for raw in later(self.log.path, at):
+            with contextlib.suppress(DamagedError):
+                if raw.opcode == Opcode.ATTACHMENT:
+                    name, data = parse_attachment(raw.content)
+                    self.log.attachments.setdefault(name, data.decode(errors="replace"))
+                elif isinstance(record := parse(raw.opcode, raw.content), Metadata):
+                    self.log.metadata.setdefault(record.name, dict(record.metadata))
 
     def _define(self, record: McapRecord) -> None:
         if isinstance(record, Header):
@@ -180,8 +205,8 @@ class _Pass:
         """The summary's count: the last word on whether a record was overlooked."""
         if self._tick_channel < 0:
             self.problems.append("it has no channel for ticks")
-        if count != self._messages_seen and not self.problems:
-            self.problems.append(f"its summary counts {count} messages, {self._messages_seen} are there")
+        if count != self.messages_seen and not self.problems:
+            self.problems.append(f"its summary counts {count} messages, {self.messages_seen} are there")
 
     def _channel(self, channel: Channel) -> None:
         """Learn a channel; a topic of ours with another schema is another program's or version's."""
@@ -216,7 +241,7 @@ class _Pass:
     def _chunk(self, data: bytes) -> Iterator[Block]:
         ticks = self._uniform(data)
         if ticks is not None:
-            self._messages_seen += len(ticks)
+            self.messages_seen += len(ticks)
             yield self._ticks(ticks)
             return
         rows = chunk_rows(data)
@@ -227,7 +252,7 @@ class _Pass:
             assert record is not None  # noqa: S101 - both kinds are parsed
             self._define(record)
         messages = rows[rows[:, 0] == MESSAGE]
-        self._messages_seen += len(messages)
+        self.messages_seen += len(messages)
         if (messages[:, 2] < FIXED_BYTES).any():
             raise DamagedError("a message is too short")
         raw = np.frombuffer(data, np.uint8)
@@ -365,7 +390,7 @@ def _read_file(log: Log) -> Iterator[Block]:
     """One file."""
     one = _Pass(log)
     try:
-        for raw in raw_records(log.path):
+        for raw in gathered(raw_records(log.path)):
             yield from one.take(raw)
     except DamagedError as error:
         one.problems.append(str(error))
@@ -377,6 +402,8 @@ def _read_file(log: Log) -> Iterator[Block]:
         raise LogError(
             f"{log.path}: is no log of hil ({'; '.join(one.problems) or 'it has no run metadata'})"
         )
+    if one.unreadable and not one.messages_seen:
+        raise LogError(f"{log.path}: {one.unreadable}; rewrite it with zstd, lz4 or none")
     if one.problems:
         log.damage = _damage(log, one)
 

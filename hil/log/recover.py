@@ -38,8 +38,9 @@ class Recovery:
 def recover(path: Path, out: Path) -> Recovery:
     """Rewrite ``path`` as the new file ``out``. Raises LogError when either can't be."""
     log = Log(path, new_ticks(0))
-    for _ in read_blocks(log):
-        pass  # metadata and attachments first, they come before the messages in the new file
+    held = sum(len(block.records) for block in read_blocks(log))  # metadata are known once it is read
+    if log.damage is not None and not held and not log.event_count:
+        raise LogError(f"{path}: holds no tick, frame or event that can be read ({log.damage})")
     try:
         with _begin(log, out) as file:
             return _copy(log, file, out)

@@ -11,10 +11,11 @@ import os
 import struct
 import zlib
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple
 
+import lz4.frame
 import numpy as np
 import numpy.typing as npt
 import zstandard
@@ -24,11 +25,13 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
 from hil.log.container import MAGIC
-from hil.log.errors import DamagedError
+from hil.log.errors import DamagedError, UnknownCompressionError
 
 MAX_CHUNK: Final = 32 << 20
 MAX_RECORD: Final = 64 << 20
-_HEAD: Final = struct.Struct("<BQ")
+GATHERED: Final = 256 << 10
+"""Bytes of messages outside of chunks that are read at once."""
+HEAD: Final = struct.Struct("<BQ")
 _LENGTH: Final = struct.Struct("<Q")
 _HEAD_ARRAY: Final = np.dtype([("opcode", "u1"), ("length", "<i8")])
 _PARSERS: Final[dict[int, Any]] = {
@@ -41,7 +44,7 @@ _PARSERS: Final[dict[int, Any]] = {
     Opcode.FOOTER: Footer,
 }
 # a length of 2^63 or more is an OverflowError of the stream that it is read from
-_MALFORMED: Final = (McapError, EOFError, ValueError, OverflowError, struct.error, zstandard.ZstdError)
+MALFORMED: Final = (McapError, EOFError, ValueError, OverflowError, struct.error, zstandard.ZstdError)
 
 
 class Raw(NamedTuple):
@@ -62,20 +65,41 @@ def raw_records(path: Path) -> Iterator[Raw]:
         while opcode != Opcode.FOOTER:
             raw = read_record(stream, at, size)
             yield raw
-            at, opcode = at + _HEAD.size + len(raw.content), raw.opcode
+            at, opcode = at + HEAD.size + len(raw.content), raw.opcode
         if stream.read(len(MAGIC)) != MAGIC:
             raise DamagedError("the end mark is missing")
 
 
+def gathered(records: Iterable[Raw]) -> Iterator[Raw]:
+    """The records, but messages that stand outside of chunks together, as the content of a chunk would be."""
+    held: list[bytes] = []
+    at = size = 0
+    try:
+        for raw in records:
+            if held and (raw.opcode != Opcode.MESSAGE or size > GATHERED):
+                yield Raw(Opcode.MESSAGE, at, b"".join(held))
+                held, size = [], 0
+            if raw.opcode != Opcode.MESSAGE:
+                yield raw
+                continue
+            at = at if held else raw.offset
+            held += (HEAD.pack(raw.opcode, len(raw.content)), raw.content)
+            size += len(raw.content)
+    except DamagedError:
+        if held:
+            yield Raw(Opcode.MESSAGE, at, b"".join(held))
+        raise
+
+
 def read_record(stream: IO[bytes], at: int, size: int) -> Raw:
     """The record at ``at``, where ``stream`` stands, of a file of ``size`` bytes."""
-    head = stream.read(_HEAD.size)
+    head = stream.read(HEAD.size)
     if not head:
         raise DamagedError(f"it breaks off after byte {at}")
-    if len(head) < _HEAD.size:
+    if len(head) < HEAD.size:
         raise DamagedError(f"it breaks off in a record at byte {at}")
-    opcode, length = _HEAD.unpack(head)
-    if length > size - at - _HEAD.size:
+    opcode, length = HEAD.unpack(head)
+    if length > size - at - HEAD.size:
         raise DamagedError(f"the record at byte {at} runs over the end of the file")
     if length > MAX_RECORD:
         raise DamagedError(f"the record at byte {at} claims {length} bytes")
@@ -90,7 +114,7 @@ def parse(opcode: int, content: bytes) -> McapRecord | None:
     try:
         # lengths inside the content can't reach beyond it: a BytesIO returns no more than it has
         record: McapRecord = parser.read(ReadDataStream(io.BytesIO(content)))
-    except _MALFORMED as error:
+    except MALFORMED as error:
         raise DamagedError(f"a malformed {parser.__name__} record") from error
     return record
 
@@ -106,7 +130,7 @@ def parse_attachment(content: bytes) -> tuple[str, bytes]:
             stream.read(stream.read8()),
         )
         crc = stream.read4()
-    except _MALFORMED as error:
+    except MALFORMED as error:
         raise DamagedError("a malformed attachment") from error
     if crc and crc != zlib.crc32(content[:-4]):
         raise DamagedError(f"attachment {name}: its checksum does not fit")
@@ -120,10 +144,12 @@ def chunk_content(chunk: Chunk) -> bytes:
         raise DamagedError(f"a chunk claims {size} bytes")
     if chunk.compression == "zstd":
         data = _decompress(chunk.data, size)
+    elif chunk.compression == "lz4":
+        data = _decompress_lz4(chunk.data, size)
     elif chunk.compression == "":
         data = chunk.data
     else:
-        raise DamagedError(f"compression {chunk.compression!r} is not known here")
+        raise UnknownCompressionError(f"compression {chunk.compression!r:.40} is not known here")
     if len(data) != size:
         raise DamagedError("a chunk has another size than it says")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
@@ -145,10 +171,19 @@ def _decompress(data: bytes, size: int) -> bytes:
     return out
 
 
+def _decompress_lz4(data: bytes, size: int) -> bytes:
+    """At most a byte more than ``size``, whatever the compressed frame claims."""
+    try:
+        out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+    except (RuntimeError, EOFError) as error:
+        raise DamagedError("a chunk can't be decompressed") from error
+    return out
+
+
 def chunk_rows(data: bytes) -> npt.NDArray[np.int64]:
     """Records of a chunk's content as rows of (opcode, start of content, length). Raises DamagedError."""
     starts, at, size = array("q"), 0, len(data)
-    keep, length_at, head = starts.append, _LENGTH.unpack_from, _HEAD.size
+    keep, length_at, head = starts.append, _LENGTH.unpack_from, HEAD.size
     try:
         while at < size:
             keep(at)

@@ -56,7 +56,7 @@ class Drain:
     def __init__(self, rings: Rings, file: RunFile | SplitFile) -> None:
         self._ticks, self._frames, self._events = rings
         self._file = file
-        self._t_ns = 0
+        self._t_ns: int | None = None
         self._lateness: list[np.ndarray[Any, np.dtype[np.int32]]] = []
 
     def once(self, *, final: bool = False) -> None:
@@ -79,7 +79,12 @@ class Drain:
         self._file.add_event(t_ns, k, kind, text)
 
     def stats(self) -> None:
-        """Write what was dropped, how full the ring was and how late the ticks since the last time were."""
+        """Write what was dropped, how full the ring was and how late the ticks since the last time were.
+
+        They are stamped with the last tick's time; before the first there is none, and nothing to tell.
+        """
+        if self._t_ns is None:
+            return
         values = {
             "ticks": self._file.ticks,
             "dropped": self._ticks.dropped,

@@ -11,7 +11,11 @@ from mcap.stream_reader import StreamReader
 from mcap_protobuf.decoder import DecoderFactory
 
 from hil.log.mcapfile import RunFile
-from hil.signals import FIELDS
+from hil.log.records import EVENT_BYTES
+from hil.log.ring import Ring
+from hil.log.schema import FRAME
+from hil.log.writer import Drain
+from hil.signals import FIELDS, TICK
 from tests.logfiles import HEADER, some_frames, some_ticks, write_log
 
 TICKS, FRAMES = some_ticks(300), some_frames(900)
@@ -49,6 +53,26 @@ def test_frames_events_and_statistics_decode(path: Path) -> None:
     frames = [(m.can_id, m.data) for topic in ("/can/rx", "/can/tx") for m in by_topic[topic]]  # type: ignore[attr-defined]
     assert sorted(frames) == sorted((int(f["can_id"]), bytes(f["data"][: f["size"]])) for f in FRAMES)
     assert len(by_topic["/event"]) == len(by_topic["/stats"]) == 6
+
+
+def test_no_statistics_are_stamped_before_the_first_tick(tmp_path: Path) -> None:
+    """A viewer's time line begins where the run does, however long the start took."""
+    sizes = {"ticks": TICK.itemsize, "frames": FRAME.itemsize, "events": EVENT_BYTES}
+    ticks, frames, events = (Ring.create(name, size, 16) for name, size in sizes.items())
+    first = TICKS[100:101]
+    with RunFile(tmp_path / "a.mcap", HEADER) as file:
+        drain = Drain((ticks, frames, events), file)
+        drain.once()
+        drain.stats()
+        ticks.push(first.tobytes())
+        drain.once(final=True)
+        drain.stats()
+        file.finish({})
+    for ring in (ticks, frames, events):
+        ring.close()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(["/stats"])]
+    assert times == [first["t_ns"][0]]
 
 
 def test_a_time_window_is_found_by_the_index(path: Path) -> None:

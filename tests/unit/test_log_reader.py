@@ -195,7 +195,6 @@ def bomb(claimed: int, real: int) -> Chunk:
         (bomb(1000, MAX_CHUNK * 4), "another size"),
         (bomb(2000, 1000), "another size"),
         (Chunk("zstd", b"no zstd at all", 0, 0, 0, 100), "decompressed"),
-        (Chunk("lz99", b"", 0, 0, 0, 0), "not known"),
         (Chunk("", bytes(8), 0, 0, 0, 8), "inside a record"),
         (Chunk("", struct.pack("<BQ", 5, 1 << 60), 0, 0, 0, 9), "runs over"),
         (Chunk("", struct.pack("<BQ", 5, 0), 0, 0, 0, 9), "too short"),
