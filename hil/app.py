@@ -276,6 +276,20 @@ def log_path(setup: Setup, kind: str) -> Path:
     return path if log.split_s is None and log.split_mb is None else part_path(path, 0)
 
 
+def plant_of(path: Path) -> dict[str, str]:
+    """The plant's file as an attachment: what is one, and nothing else that the path may lead to."""
+    from firmware_model.config import PlantConfig
+
+    try:
+        if not path.is_file():
+            raise ConfigError(str(path), ["no such file"])
+        load_toml(path, PlantConfig)
+        return {"plant.toml": path.read_text(encoding="utf-8")}
+    except (ConfigError, OSError, ValueError) as error:
+        say(f"no plant is kept in the log: {str(error).splitlines()[0]}")
+        return {}
+
+
 def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
     """Metadata and attachments that make a log self-contained."""
     packages = ("numpy", "scipy", "numba", "python-can", "mcap")
@@ -286,9 +300,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
         "drive.dbc": setup.database.text,
     }
     if setup.config.emulator is not None:
-        plant = setup.path.parent / setup.config.emulator.plant
-        if plant.is_file():
-            attachments["plant.toml"] = plant.read_text(encoding="utf-8")
+        attachments |= plant_of(setup.path.parent / setup.config.emulator.plant)
     return {
         "metadata": {
             "kind": kind,

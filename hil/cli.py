@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+import select
 import signal
 import sys
 import threading
@@ -101,8 +102,31 @@ class _Version(argparse.Action):
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; every refusal is one clear line on standard error and exit code 2."""
+    """Entry point; what nobody reads any more (``| head``) ends quietly with exit code 141."""
     _open_what_is_closed()
+    try:
+        try:
+            return _command(argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        if not (left := _left_by_readers()):
+            raise
+        for number in left:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), number)  # what is still buffered goes nowhere
+        return 128 + signal.SIGPIPE
+
+
+def _left_by_readers() -> list[int]:
+    """Of standard output and error those that are pipes without a reader."""
+    watch = select.poll()
+    for number in (1, 2):
+        watch.register(number, 0)
+    return [number for number, event in watch.poll(0) if event & select.POLLERR]
+
+
+def _command(argv: list[str] | None) -> int:
+    """One command; every refusal is one clear line on standard error and exit code 2."""
     args = _parser().parse_args(argv)
     try:
         with _signals_unwind():

@@ -60,9 +60,11 @@ class Table(BaseModel):
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file of at most 1 MiB. Raises ConfigError with the file's name and the line."""
     try:
-        if path.stat().st_size > MAX_CONFIG_BYTES:
+        with path.open("rb") as stream:  # a device has no size, and no end
+            raw = stream.read(MAX_CONFIG_BYTES + 1)
+        if len(raw) > MAX_CONFIG_BYTES:
             raise ConfigError(str(path), [f"larger than {MAX_CONFIG_BYTES} bytes; this is no configuration"])
-        text = path.read_text(encoding="utf-8")
+        text = raw.decode()
     except OSError as error:
         raise ConfigError(str(path), [f"can't be read: {error.strerror or error}"]) from error
     except UnicodeDecodeError as error:

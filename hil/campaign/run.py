@@ -18,6 +18,7 @@ from hil.campaign.page import page
 from hil.campaign.plan import PlanTable, read_plan
 from hil.campaign.store import Folder, Schema, kind_of
 from hil.errors import HilError
+from hil.outputs import output_file
 
 BATCH_TICKS: Final = 700_000
 """Ticks of a batch: about half a second of a core; what a lost worker takes along."""
@@ -159,6 +160,7 @@ def campaign(
         raise HilError(f"{workers} workers: take 1 or more, or 0 for this process")
     store.arrow()
     held = store.make(Path(folder), about_of(job, stand), job.files, resume=resume)
+    output_file(held.path / PAGE, ".html")
     used = where(stand, workers, scheduler)
     if used.count or used.scheduler:
         warm(stand)

@@ -64,7 +64,8 @@ class Folder:
         self._waiting: list[Row] = []
         self._clock = RealClock()
         self._written_ns = self._clock.now_ns()
-        self._number = len(self.parts())
+        numbers = [int(part.stem[5:]) for part in self.parts() if part.stem[5:].isdecimal()]
+        self._number = max(numbers, default=-1) + 1  # one that was removed leaves a hole, not a place
 
     def parts(self) -> list[Path]:
         """The files of rows."""

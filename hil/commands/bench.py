@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, bus_flags, output_folder, overrides, print_json, say
+from hil.commands.common import Commands, bus_flags, overrides, print_json, say
+from hil.outputs import output_folder
 
 
 def register(commands: Commands) -> None:
@@ -36,7 +37,7 @@ def cmd_bench(args: argparse.Namespace) -> int:
     from hil.view import key_values, show
 
     earlier = read_result(args.compare) if args.compare else None
-    out = output_folder(args.output) if args.output else None
+    out = output_folder(args.output, "lateness.png", "bench.html") if args.output else None
     path = args.config or find_config("demo.toml")
     done = bench(path, overrides(args), QUICK if args.quick else FULL, say, keep_awake=args.awake)
     result = done.result

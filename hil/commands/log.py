@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, one_run, output_log, print_json
+from hil.commands.common import Commands, one_run, print_json
+from hil.outputs import output_log
 
 
 def register(commands: Commands) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import Commands, output_folder, say
+from hil.commands.common import Commands, say
+from hil.outputs import output_folder
 
 
 def register(commands: Commands) -> None:
@@ -26,7 +27,7 @@ def cmd_paper(args: argparse.Namespace) -> int:
     from hil.shipped import find_config
     from hil.view import show
 
-    out = output_folder(args.output)
+    out = output_folder(args.output, "paper.html")
     say("paper: the corrected design on the bench over the bus (lockstep), then every figure; under a minute")
     settings = ('loop.clock="lockstep"', f'log.folder="{out.resolve()}"')
     _, _, log = closed_loop(find_config("paper.toml"), Overrides(settings=settings))

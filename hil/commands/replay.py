@@ -7,7 +7,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, one_run, output_file, output_log, print_json, say
+from hil.commands.common import Commands, one_run, print_json, say
+from hil.outputs import output_file, output_log
 
 if TYPE_CHECKING:
     from hil.replay import Verdict, Window

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, output_file, print_json
+from hil.commands.common import EXIT_FAILED, Commands, print_json
+from hil.outputs import output_file
 
 
 def register(commands: Commands) -> None:

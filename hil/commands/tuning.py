@@ -8,16 +8,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hil.commands.common import (
-    EXIT_FAILED,
-    Commands,
-    bus_flags,
-    output_file,
-    output_folder,
-    overrides,
-    print_json,
-    say,
-)
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
+from hil.outputs import output_file, output_folder
 
 SPREAD = 0.3
 
@@ -162,7 +154,7 @@ def cmd_compare(args: argparse.Namespace) -> int:
     from hil.view import progress, show
 
     families = parse_laws(",".join(DEFAULT_LAWS) if args.laws is None else args.laws)
-    out = output_folder(args.output)
+    out = output_folder(args.output, "compare.html")
     wish = Wish(args.u_noise_mv, args.ms, args.ms_worst, args.spread, args.seeds, args.effort)
     with progress(f"tune {len(families)} laws", len(families)) as seen:
         found = compare(args.config, overrides(args), families, wish, seen)

@@ -15,16 +15,20 @@ from drivers.codec import Database
 from drivers.dbc import MAX_DBC_BYTES
 from drivers.errors import DatabaseError
 from firmware_model.config import PlantConfig
+from hil.app import plant_of
 from hil.config import MAX_CONFIG_BYTES, RunConfig, load_toml, read_toml
 from hil.errors import ConfigError
 from hil.faults.matrix import Matrix
-from tests.conftest import ROOT
+from tests.conftest import CONFIGS, ROOT
 
 PACKAGES = ("hil", "drivers", "firmware_model")
 RUNS_CODE = {"eval", "exec", "compile", "__import__"}
 LOADS_CODE = {"pickle", "cPickle", "marshal", "shelve", "dill", "joblib", "yaml"}
 # (file, call): what runs code that the project itself has made of checked parts
-ALLOWED = {("drivers/compiled.py", "exec")}
+ALLOWED = {
+    ("drivers/compiled.py", "exec"),
+    ("hil/campaign/case.py", "pickle"),  # copies its own checked tables within the process
+}
 MODELS = (RunConfig, PlantConfig, Matrix)
 
 
@@ -183,3 +187,32 @@ def test_a_dbc_above_the_bound_is_refused_and_one_below_is_looked_at(tmp_path: P
     path.write_bytes(b" " * (MAX_DBC_BYTES + 1))
     with pytest.raises(DatabaseError, match="larger than"):
         Database(path)
+
+
+@pytest.mark.parametrize("kind", ["secret", "run", "long", "binary", "fifo", "none"])
+def test_only_a_plant_is_kept_in_a_log(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "plant.toml"
+    match kind:
+        case "secret":
+            path.write_text("-----BEGIN OPENSSH PRIVATE KEY-----\nb3BlbnNzaC1rZXk\n")
+        case "run":
+            path.write_bytes((CONFIGS / "demo.toml").read_bytes())
+        case "long":
+            path.write_text("#" * (MAX_CONFIG_BYTES + 1))
+        case "binary":
+            path.write_bytes(b"\xff\xfe\x00" * 100)
+        case "fifo":
+            os.mkfifo(path)
+    assert plant_of(path) == {}
+    said = capsys.readouterr().err
+    assert said.startswith(f"hil: no plant is kept in the log: {path}: ") and said.count("\n") == 1
+    assert "b3Blb" not in said
+    own = CONFIGS / "plants" / "demo.toml"
+    assert plant_of(own) == {"plant.toml": own.read_text(encoding="utf-8")}
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("path", [Path("/dev/zero"), Path("/dev/urandom")], ids=str)
+def test_a_file_without_an_end_is_no_config(path: Path) -> None:
+    with pytest.raises(ConfigError, match="larger than"):
+        read_toml(path)
