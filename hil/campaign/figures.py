@@ -15,14 +15,15 @@ import numpy as np
 
 from hil.config import LimitsTable, RunConfig
 from hil.report.criteria import FIGURES, check_limit, demanded
+from hil.report.excursions import Excursions
 from hil.report.segments import Responses
 from hil.report.statistics import Phases, Totals
 from hil.signals import DriveState, Reason, TickArray
 
 BLOCK: Final = 8192
 COLUMNS: Final = (
-    "k", "w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat", "state", "rx_flags",
-    "guard_flags", "skipped", "gap",
+    "k", "w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat", "state", "reason",
+    "rx_flags", "guard_flags", "skipped", "gap",
 )  # fmt: skip
 EXTRA: Final = {
     "w_peak_rad_s": "largest |w|, rad/s",
@@ -58,6 +59,7 @@ class Judged:
     N: int
     totals: Totals = field(default_factory=Totals)
     responses: Responses = field(default_factory=Responses)
+    excursions: Excursions = field(default_factory=Excursions)
     phases: Phases = field(default_factory=Phases)
     reason: Reason = Reason.NONE
     state: DriveState = DriveState.SWITCH_ON_DISABLED
@@ -86,6 +88,7 @@ class Judged:
             t = found["k"].astype(np.float64) * (self.config.loop.period_ns * 1e-9)
             self.totals.feed(t, found)
             self.responses.feed(t, found)
+            self.excursions.feed(t, found)
             self._extra(found)
 
     def _extra(self, found: Any) -> None:
@@ -106,6 +109,7 @@ class Judged:
         run: Any = SimpleNamespace(
             totals=self.totals,
             responses=self.responses,
+            excursions=self.excursions,
             phases=self.phases,
             log=result,
             bus_load=lambda: None,

@@ -22,7 +22,7 @@ from hil.report.criteria import figures
 from hil.simulate import simulate
 from tests.conftest import CONFIGS
 
-SHORT = 'set = ["loop.duration_s=0.6", "reference.at_s=0.05"]\nplant_set = ["load.1.at_s=0.3"]\n'
+SHORT = 'set = ["loop.duration_s=0.6", "reference.at_s=0.05"]\nplant_set = ["load.0.at_s=0.3"]\n'
 J = '"plant:motor.J_kg_m2"'
 
 

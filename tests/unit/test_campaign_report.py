@@ -23,12 +23,12 @@ PLAN = f"""name = "two <laws>"
 config = "{CONFIGS / "demo.toml"}"
 samples = 12
 set = ["loop.duration_s=1.7", "reference.at_s=0.05", "criteria.dip_max_rad_s=1.5"]
-plant_set = ["load.1.at_s=1.2", "load.1.torque_n_m=2.0"]
+plant_set = ["load.0.at_s=1.2", "load.0.torque_n_m=2.0"]
 [variants.shipped]
 [variants.slow]
 "controller.speed_pole_rad_s" = 15.0
 [random]
-"plant:load.1.torque_n_m" = [1.0, 3.0]
+"plant:load.0.torque_n_m" = [1.0, 3.0]
 "plant:motor.R_s_ohm" = [2.8, 2.9]
 """
 
@@ -55,7 +55,7 @@ def test_the_page_needs_nothing_and_lets_nothing_run(made: Path) -> None:
 def test_the_load_matters_for_the_dip_and_a_slower_law_dips_deeper(made: Path) -> None:
     held = store.open_folder(made)
     dip = summary.figure_of(held, "dip_rad_s")
-    assert summary.importance(held, "plant:load.1.torque_n_m", dip) > 0.5
+    assert summary.importance(held, "plant:load.0.torque_n_m", dip) > 0.5
     assert abs(summary.importance(held, "plant:motor.R_s_ohm", dip)) < 0.5
     (found,) = summary.paired(held, "variant").values()
     dips = next(one for one in found if one.key == "dip_rad_s")
