@@ -11,14 +11,14 @@ import math
 from typing import Any
 
 from firmware_model.jit import jit
-from firmware_model.plant import MAX_LOADS, SLIDE, STRIBECK, LoadKind
+from firmware_model.plant import SLIDE, STRIBECK, LoadKind
 
 
 @jit
 def level(p: Any, t: float) -> float:
     """T_c with the brakes that are on at t [s]."""
     total = p["coulomb"]
-    for j in range(MAX_LOADS):
+    for j in range(p["loads"]):
         if p["load_kind"][j] == LoadKind.BRAKE and p["load_b"][j] <= t < p["load_c"][j]:
             total += p["load_a"][j]
     return float(total)

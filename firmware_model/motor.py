@@ -51,7 +51,7 @@ def series(
     """Coefficients of w, i_q, i_d [unit / s^k] about t [s] in rows 0 to 2 of ``c``, for a step of h [s].
 
     With the gates off no current flows and only the shaft moves. With friction the shaft slides the way that
-    row SLIDE says, or sticks; what drives it goes to row DRIVE.
+    row SLIDE says, or sticks; what drives it then goes to row DRIVE.
     """
     n_p, R_s, L_d, L_q, inverse_J = p["n_p"], p["R_s"], p["L_d"], p["L_q"], 1.0 / p["J"]
     inverse_d, inverse_q = 1.0 / L_d, 1.0 / L_q
@@ -74,7 +74,8 @@ def series(
             dq += p["phi_q"] + u_q * inverse_q
             dd += u_d * inverse_d
         if p["rubs"]:
-            c[DRIVE, k] = dw / inverse_J
+            if slide == 0.0:
+                c[DRIVE, k] = dw / inverse_J
             dw -= slide * ((T_coulomb if k == 0 else 0.0) + stribeck_coefficient(p, c, k)) * inverse_J
             dw *= abs(slide)
         w[k + 1] = dw * share

@@ -52,11 +52,22 @@ def within(a: Any, h: float, error: float) -> float:
 
 
 @jit
+def stays_clear(a: Any, value: float, h: float) -> bool:
+    """True when |a_0 - value| > sum_{k>0} |a_k| h^k, with room for rounding: no time in [0, h] crosses."""
+    reach = abs(a[ORDER])
+    for k in range(ORDER - 1, 0, -1):
+        reach = reach * h + abs(a[k])
+    return bool(abs(a[0] - value) > 1.001 * reach * h + 1e-12 * (abs(a[0]) + abs(value)))
+
+
+@jit
 def first_crossing(a: Any, value: float, h: float) -> float:
     """First time in (0, h] at which the series has passed ``value``, to rounding; infinite if it does not.
 
     What begins at ``value`` has passed it once it is on the other side of where it first went.
     """
+    if stays_clear(a, value, h):
+        return math.inf
     side, before = a[0] - value, 0.0
     for n in range(1, LOOKS + 1):
         now = h * n / LOOKS
