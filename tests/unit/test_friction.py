@@ -12,8 +12,9 @@ from scipy.integrate import solve_ivp
 
 from firmware_model.config import Inverter, PlantConfig, Wire, build_params, new_state
 from firmware_model.drive import advance
-from firmware_model.plant import ErrorCode, State
+from firmware_model.plant import ORDER, ErrorCode, State
 from firmware_model.rub import friction_torque
+from firmware_model.series import LOOKS, evaluate, first_crossing, stays_clear
 
 MOTOR = {
     "R_s_ohm": 2.875, "L_d_h": 0.033, "L_q_h": 0.033, "psi_f_wb": 0.8, "n_p": 3, "J_kg_m2": 0.011,
@@ -226,3 +227,28 @@ def test_too_much_of_it_trips_the_drive() -> None:
 def test_half_a_link_is_refused(table: dict[str, float], said: str) -> None:
     with pytest.raises(ValidationError, match=said):
         Inverter.model_validate(table)
+
+
+def test_a_series_that_cannot_reach_a_value_crosses_it_nowhere_and_one_that_does_is_searched() -> None:
+    random = np.random.default_rng(7)
+    clear = crossed = 0
+    for _ in range(3000):
+        a, h = (
+            random.normal(size=ORDER + 1) * 10.0 ** random.integers(-3, 4, ORDER + 1),
+            10.0 ** random.uniform(-4, 0),
+        )
+        value = a[0] + random.choice([0.0, 1.0, -1.0]) * 10.0 ** random.uniform(-14, 3)
+        sides = {np.sign(evaluate(a, h * n / LOOKS) - value) for n in range(LOOKS + 1)} - {0.0}
+        assert (first_crossing(a, value, h) < math.inf) == (len(sides) == 2)
+        assert not (stays_clear(a, value, h) and len(sides) != 1)
+        clear, crossed = clear + stays_clear(a, value, h), crossed + (len(sides) == 2)
+    assert min(clear, crossed) > 300
+
+
+def test_what_is_no_number_and_what_begins_at_the_value_are_searched() -> None:
+    a = np.zeros(ORDER + 1)
+    assert not stays_clear(a, 0.0, 1e-3)  # at rest, at the value
+    a[1] = math.nan
+    assert not stays_clear(a, 1.0, 1e-3)
+    a[:3] = 0.0, 1.0, -2.0  # passes 0 again at 0.5
+    assert not stays_clear(a, 0.0, 1.0) and first_crossing(a, 0.0, 1.0) == pytest.approx(0.5)
