@@ -50,6 +50,19 @@ def test_deliberate_breaks_of_guard_and_client_are_noticed() -> None:
     assert done.stdout.count(" input ") > 20
 
 
+@pytest.mark.compiled
+@pytest.mark.parametrize(
+    "more", [["--inputs", "100"], ["--inputs", "60", "--unchecked"]], ids=["as is", "unchecked"]
+)
+def test_no_logged_number_leads_a_kernel_out_of_its_arrays(more: list[str]) -> None:
+    """With the reader's ranges left out the bounds checks find it: so they are on, and find what there is."""
+    command = [sys.executable, "-m", "tests.fuzz.bounds", *more]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert ("out of bounds" in done.stdout) == ("--unchecked" in more)
+
+
 def test_a_failure_names_its_input(tmp_path: Path) -> None:
     def take(data: bytes) -> None:
         raise ZeroDivisionError(len(data))
