@@ -11,7 +11,9 @@ output but the command (computed anew). How many periods were skipped before a t
 and what had been read by the time of the command is not there either, but the commands prove it, and a wrong
 guess is taken back once a later one shows it (:mod:`hil.convert.search`). Where no command depends on it the
 guess by the stamps stands: at periods skipped while the drive is being enabled or stopped, at their place
-within a stretch of held commands, and in a listener's recording at the tick that took a status frame.
+within a stretch of held commands, and at the tick that took a status frame. In a listener's recording one
+that came between measurement and command may have been read with either of two ticks; the first of each
+kind enables the drive, which shows. The controller's own side recorded frames as it read them.
 """
 
 from __future__ import annotations

@@ -40,18 +40,21 @@ class Heard(NamedTuple):
 class Roles(NamedTuple):
     """Which identifiers play which part: ``sync`` is None where the drive sends by its own clock.
 
-    ``measuring``: the messages of a measurement, all of which make one; ``commands``: the controller's.
+    ``measuring``: the messages of a measurement, all of which make one; ``commands``: the controller's;
+    ``slow``: what else the drive is judged by, as its status.
     """
 
     sync: int | None
     measuring: frozenset[int]
     commands: Collection[int]
+    slow: frozenset[int] = frozenset()
 
 
 @dataclass(slots=True)
 class Period:
     """The frames of one tick: ``late`` came before its SYNC, ``answers`` to it, then ``commands``.
 
+    ``after``: what a listener heard between a measurement and its command, read with this tick or the next.
     ``t_ns``: when SYNC passed, or the measurement was complete; ``answered_ns``, ``sent_ns``: the last of
     each, -1 for none. ``closed`` is False for the last one, which may be cut off.
     """
@@ -60,6 +63,7 @@ class Period:
     late: list[Heard] = field(default_factory=list)
     answers: list[Heard] = field(default_factory=list)
     commands: list[Heard] = field(default_factory=list)
+    after: list[Heard] = field(default_factory=list)
     answered_ns: int = -1
     sent_ns: int = -1
     closed: bool = True
@@ -168,7 +172,8 @@ def _by_feedback(frames: Iterable[Whose], roles: Roles, period_ns: int, merge_ns
 
     Of several measurements before a command the loop takes the newest and counts the others as skipped. A
     command without a measurement is a tick whose wait was in vain. What else the drive says after it has
-    measured is read with the next tick, unless the controller itself has recorded that it read it before.
+    measured is read with the next tick, if the controller itself has not recorded that it read it before; of
+    what came before the command a listener can't know.
     """
     period, queued, missing = Period(0), list[Heard](), set(roles.measuring)
     commanded_ns = -merge_ns
@@ -184,6 +189,9 @@ def _by_feedback(frames: Iterable[Whose], roles: Roles, period_ns: int, merge_ns
             period, queued, missing = Period(0, answers=queued), [], set(roles.measuring)
             opened = False
         if own:
+            if not period.commands:  # the first of all tells whose recording it is
+                period.answers += queued if as_read else []
+                period.after, queued = [] if as_read else queued, []
             period.command(frame)
             commanded_ns = frame.t_ns
             period.t_ns = frame.t_ns if missing else period.t_ns

@@ -83,7 +83,8 @@ def roles_of(binding: Binding) -> Roles:
     """The identifiers of a binding by their parts."""
     measuring = (b.message.send_id for b in binding.incoming if {part for part, _ in b.parts} & set(MEASURED))
     commands = {bound.message.send_id for bound in binding.outgoing}
-    return Roles(binding.sync.send_id if binding.sync else None, frozenset(measuring), commands)
+    slow = frozenset(bound.message.send_id for bound in binding.slow)
+    return Roles(binding.sync.send_id if binding.sync else None, frozenset(measuring), commands, slow)
 
 
 class Before(NamedTuple):
@@ -173,15 +174,29 @@ class Run:
         What came meanwhile is on the wire before what was sent, but read after it: before the command, the
         next tick reads it; before SYNC, it is no late answer but this tick's.
         """
-        frames = [*self._left, *period.late, *period.answers]
-        end = len(frames)
+        frames = [*self._left, *period.late, *period.answers, *period.after]
+        end = len(frames) - len(period.after)
         sync = 0 if self.roles.sync is None else end - len(period.answers)
         yield Reading(sync, end, likely=True)
         if self.shadow or not period.commands:
             return
-        measures = [at for at, frame in enumerate(frames) if frame.can_id in self.roles.measuring]
-        for at in measures[: -READINGS_MOST - 1 : -1]:
+        if any(frame.can_id in self.roles.slow for frame in period.after):
+            yield Reading(sync, len(frames))
+        for at in self._ends(frames[:end]):
             yield Reading(sync, at) if at >= sync else Reading(at, end)
+
+    def _ends(self, frames: list[Heard]) -> list[int]:
+        """Where the loop may have stopped reading: before the newest measurement first.
+
+        A drive sends its status in one go with the measurement that follows, so that most likely both were
+        read or none.
+        """
+        measured, ends = 0, []
+        for at, frame in enumerate(frames):
+            if frame.can_id in self.roles.measuring | self.roles.slow:
+                ends.append((measured, at))
+            measured -= frame.can_id in self.roles.measuring
+        return [at for _, at in sorted(ends)[:READINGS_MOST]]
 
     def _ways(self, gaps: list[int], reading: Reading) -> Iterator[tuple[int, int]]:
         """Gap and request, the likeliest first: a stop that is asked for shows whatever the gap."""
@@ -197,7 +212,7 @@ class Run:
     def _read(self, reading: Reading, period: Period, ahead: list[int]) -> list[int]:
         """Read what the loop has read; return the gaps that the tick may have, the likeliest first."""
         self._tick["rx_flags"], self._tick["missing"] = 0, ALL_MISSING
-        frames = [*self._left, *period.late, *period.answers]
+        frames = [*self._left, *period.late, *period.answers, *period.after]
         late, read, self._left = (
             frames[: reading.sync],
             frames[reading.sync : reading.end],

@@ -29,7 +29,8 @@ from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.process
 
-NOT_ON_THE_WIRE = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns"}
+NOT_ON_THE_WIRE = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns", "check"}
+"""Times, and the check that a record carries over all its fields, these included; replay judges that."""
 
 
 @dataclass(frozen=True)

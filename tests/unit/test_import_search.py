@@ -7,7 +7,7 @@ the controller read and sent them, and as a listener on the wire saw them. No pr
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from drivers.client import DriveClient
+from drivers.codec import Message
 from drivers.mapping import MEASURED
 from hil.app import Overrides, Setup, load_setup
 from hil.convert.periods import HELD_PERIODS, Heard, periods
@@ -37,13 +38,25 @@ def setup_of(name: str, *more: str) -> Setup:
     return load_setup(CONFIGS / name, Overrides(settings=(*patient, *more)))
 
 
+SLOW, FIRST = 10, 5
+"""Measurements to a status, and to the first: the drive is not enabled before that has come."""
+HEALTHY = {"v_dc": 540.0, "temperature_motor": 25.0, "temperature_inverter": 25.0}
+
+
 class World:
-    """Clock, drive port and recorder of a loop, all of one time."""
+    """Clock, drive port and recorder of a loop, all of one time.
+
+    ``slow``: when the drive says its status: before its measurement as the emulated drives do, after it in
+    one go, or late, once the controller has read the measurement. ``first``: with which measurement first.
+    """
 
     failed = False
 
-    def __init__(self, setup: Setup, hold: Hold, seed: int = 1) -> None:
+    def __init__(
+        self, setup: Setup, hold: Hold, seed: int = 1, slow: str = "before", first: int = FIRST
+    ) -> None:
         self.tape, self.binding, self._hold = Tape(), setup.binding, hold
+        self._slow, self._first = slow, first
         self.client = DriveClient(self.tape, setup.database, drive_map=setup.binding.map, now=lambda: 0)
         self.now, self.n, self.period_ns = 0, 0, setup.config.loop.period_ns
         self.rng = np.random.default_rng(seed)
@@ -65,6 +78,22 @@ class World:
         values = {signal: given.get(part, 0.0) for part, signal in self._bound.parts}
         values[self._bound.counter] = self._count % self._bound.counter_modulus
         message = self._bound.message
+        if self._slow == "before":
+            self._say_slow(t_ns)
+        self._say(t_ns, message, values)
+        if self._slow == "after":
+            self._say_slow(t_ns)
+
+    def _say_slow(self, t_ns: int) -> None:
+        if self._count % SLOW != self._first:
+            return
+        for bound in self.binding.slow:
+            values = {signal: HEALTHY.get(part, 0.0) for part, signal in bound.parts}
+            if bound.counter:
+                values[bound.counter] = self._count // SLOW % bound.counter_modulus
+            self._say(t_ns, bound.message, values)
+
+    def _say(self, t_ns: int, message: Message, values: Mapping[str, float]) -> None:
         frame = Heard(t_ns, message.send_id, True, message.fd, message.encode(values))
         self.queue.append(frame)
         self.wire.append(frame)
@@ -134,6 +163,8 @@ class World:
 
     def send(self, tick: Any) -> None:
         self._held("send")
+        if self._slow == "late":
+            self._say_slow(self.now)
         self.client.send(tick)
         self._sent()
         self._state, self._echo = STATES.get(int(tick["controlword"]), 1), int(tick["counter"])
@@ -153,10 +184,12 @@ class World:
         pass
 
 
-def ran(name: str, hold: Hold, ticks: int = 300, seed: int = 1) -> World:
+def ran(
+    name: str, hold: Hold, ticks: int = 300, seed: int = 1, slow: str = "before", first: int = FIRST
+) -> World:
     """A run in such a world."""
     setup = setup_of(name)
-    world, machine = World(setup, hold, seed), setup.machine.fresh()
+    world, machine = World(setup, hold, seed, slow, first), setup.machine.fresh()
 
     def step(record: TickArray) -> None:
         machine.prepare(record)
@@ -300,8 +333,30 @@ def test_a_drive_that_was_there_before_the_controller() -> None:
     world = ran("inverter.toml", at())
     first = commands(world.own, setup_of("inverter.toml"))[0]
     sent = [f._replace(t_ns=f.t_ns - 20 * MS) for f in world.own[:first] * 15]
-    sent = [f._replace(t_ns=f.t_ns + i * MS) for i, f in enumerate(sent)]
+    sent = [f._replace(t_ns=f.t_ns + i // first * MS) for i, f in enumerate(sent)]
     assert_same(world, [*sent, *world.own], "inverter.toml")
+
+
+@pytest.mark.parametrize("slow", ["after", "late"])
+def test_a_listener_finds_when_the_status_was_read_that_enables_the_drive(slow: str) -> None:
+    """On the wire it is between measurement and command; the controller reads it at once, or a tick later.
+
+    No command depends on those that follow: the likely guess stands.
+    """
+    world = ran("inverter.toml", at(), slow=slow)
+    true = np.concatenate(world.ticks)
+    enabled = np.nonzero(true["state"] == DriveState.OPERATION_ENABLED)[0][0]
+    came = np.nonzero(np.isfinite(true["v_dc"]))[0][0]
+    assert came == (FIRST if slow == "late" else FIRST - 1) and enabled - came <= 1
+    assert_same(world, world.wire, "inverter.toml", *(("missing", "rx_flags") if slow == "after" else ()))
+
+
+@pytest.mark.parametrize("slow", ["before", "after", "late"])
+@pytest.mark.parametrize("first", [1, FIRST])
+def test_the_controllers_own_recording_tells_when_each_status_was_read(slow: str, first: int) -> None:
+    """From the first tick on, whose command is the first frame that tells whose recording it is."""
+    world = ran("inverter.toml", at(), slow=slow, first=first)
+    assert_same(world, world.own, "inverter.toml")
 
 
 def test_a_recording_without_a_command_is_not_of_this_controller() -> None:
