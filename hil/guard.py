@@ -292,6 +292,26 @@ def to_wire(value: float, lsb: float) -> float:
 
 
 @jit
+def inward(value: float, lsb: float) -> float:
+    """Round toward zero to a step of the wire; what is a step up to float64's rounding stays that step."""
+    return float(np.trunc(value / lsb * (1.0 + 1e-12)) * lsb + 0.0)
+
+
+@jit
+def voltage_to_wire(p: Any, u_q: float, u_d: float, limit: float) -> tuple[float, float]:
+    """Round a voltage in the circle of radius ``limit`` to the wire, without leaving the circle.
+
+    The nearest steps may lie outside of it, by up to u_lsb / sqrt(2): then both go toward zero. Version 0
+    takes the nearest.
+    """
+    lsb = p["u_lsb"]
+    q, d = to_wire(u_q, lsb), to_wire(u_d, lsb)
+    if p["rules"] > 0 and q * q + d * d > limit * limit * (1.0 + 1e-12):
+        return inward(u_q, lsb), inward(u_d, lsb)
+    return q, d
+
+
+@jit
 def is_denormal(value: float) -> bool:
     """True for a number other than 0 below the smallest normal float64."""
     return value != 0.0 and abs(value) < 2.2250738585072014e-308
@@ -351,9 +371,8 @@ def guard_command(p: Any, s: Any, t: Any, u_q: float, u_d: float, T_L: float) ->
     load = min(max(T_L, -p["T_L_max"]), p["T_L_max"])
     flags |= GuardFlag.LOAD_TORQUE.value if load != T_L else 0
     flags |= GuardFlag.APPLIED_DEVIATES.value if deviates(p, s, t) else 0
-    write_command(
-        s, t, to_wire(step_q, p["u_lsb"]), to_wire(step_d, p["u_lsb"]), to_wire(load, p["T_L_lsb"]), flags
-    )
+    q, d = voltage_to_wire(p, step_q, step_d, limit)
+    write_command(s, t, q, d, to_wire(load, p["T_L_lsb"]), flags)
     return persistent_excess(p, s, flags)
 
 

@@ -18,7 +18,7 @@ VALUES: dict[str, float] = {
     "trip_ticks": 3, "guard_trip_ticks": 5, "hold_ticks": 3, "quick_stop_ticks": 20, "error_budget": 8,
     "enable_ticks": 100, "max_gap": 20, "counter_modulus": 16, "u_lsb": 0.01, "T_L_lsb": 0.01, "J": 0.011,
     "frozen_ticks": 5, "repeat_ticks": 2**62, "frozen_du": 0.66, "w_error_max": math.inf, "w_error_ticks": 1,
-    "i_d_max": math.inf, "open_phase_min": math.inf,
+    "i_d_max": math.inf, "open_phase_min": math.inf, "rules": 1,
 }  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.guard import (
+    inward,
     is_denormal,
     is_frozen,
     limit_step,
@@ -135,7 +136,7 @@ def test_whatever_is_asked_what_leaves_is_safe(
         assert (got_q, got_d, got_T) == (0.0, 0.0, 0.0)
         return
     assert abs(got_q - before_q) <= 50.0 + 0.01 and abs(got_d) <= 50.0 + 0.01 and abs(got_T) <= 10.0
-    assert math.hypot(got_q, got_d) <= 300.0 + 0.01
+    assert math.hypot(got_q, got_d) <= 300.0 + 1e-9
 
 
 def test_to_wire_is_what_a_codec_does() -> None:
@@ -196,6 +197,21 @@ def test_repeated_readings_of_a_turning_motor_are_frozen_where_sensors_are_noisy
     assert not any(frozen_after(guard, 20))
 
 
+@pytest.mark.parametrize("rules", [0, 1])
+def test_rounding_to_the_wire_does_not_leave_the_circle(rules: int) -> None:
+    """The nearest steps of a command on the circle, (299.3, -20.5), are 1.2 mV outside of it."""
+    asked = (math.sqrt(300.0**2 - 20.496**2), -20.496)
+    u_q, u_d, *_ = Guard(du_max=1e9, rules=rules).ask(*asked)
+    assert (u_q, u_d) == [(29930 * 0.01, -2050 * 0.01), (29929 * 0.01, -2049 * 0.01)][rules]
+    assert (math.hypot(u_q, u_d) <= 300.0) == bool(rules)
+
+
+@pytest.mark.parametrize("asked", [(300.0, 0.0), (-180.0, 240.0), (0.0, -300.0), (299.29, 20.6)])
+def test_a_step_of_the_wire_in_the_circle_is_sent_as_it_is(asked: tuple[float, float]) -> None:
+    assert Guard(du_max=1e9).ask(*asked)[:2] == asked
+    assert [inward(u, 0.01) for u in asked] == list(asked)
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_limited_step_stays_in_the_circle(seed: int) -> None:
     """Both axes limited by themselves reached 311 V of 300: from (212, 212) towards (300, 0)."""
@@ -204,4 +220,4 @@ def test_a_limited_step_stays_in_the_circle(seed: int) -> None:
     for _ in range(40):
         angle = random.uniform(0, 2 * math.pi)
         u_q, u_d, *_ = guard.ask(900 * math.cos(angle), 900 * math.sin(angle))
-        assert math.hypot(u_q, u_d) <= 300.0 + 0.01, f"seed {seed}"
+        assert math.hypot(u_q, u_d) <= 300.0 + 1e-9, f"seed {seed}"

@@ -327,7 +327,7 @@ def test_which_changes_count_as_an_excess(flag: GuardFlag) -> None:
 def test_the_circle_is_allowed_and_past_it_the_direction_stays() -> None:
     guard = Guard(du_max=1e9)
     assert guard.ask(180.0, 240.0) == (180.0, 240.0, 0.0, 0, 0)
-    assert guard.ask(180.0, -240.3)[:2] == (179.86, -240.11)
+    assert guard.ask(180.0, -240.3)[:2] == (179.85, -240.1)
     assert guard.t["guard_flags"] == GuardFlag.VOLTAGE
     assert guard.ask(240.1, -180.0)[3] == GuardFlag.VOLTAGE
 
