@@ -6,9 +6,9 @@ and its number alone: every cache here is of a pure function.
 
 from __future__ import annotations
 
-import pickle
 import tempfile
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
@@ -54,23 +54,23 @@ class Stand:
         self._plants = lru_cache(maxsize=16)(self._read_plant)
         self._databases = lru_cache(maxsize=16)(Database)
         self._wires = lru_cache(maxsize=16)(lambda dbc, node, kind: wire_of(self._databases(dbc, node), kind))
-        self._setups: dict[bytes, Setup] = {}
+        self._setups: dict[str, Setup] = {}
         self.plan: Plan = Builder(where, self.own).build(table)
         for key, value in self.plan.fixed.items():
             put(self._config, key, value, path.parent)
 
-    def _read_plant(self, name: str) -> bytes:
+    def _read_plant(self, name: str) -> dict[str, Any]:
         path = self.path.parent / name
         data = _opened(read_toml(path), path.parent)
         for text in self._plant_set:
             override(data, text, path.parent)
-        return pickle.dumps(data)
+        return data
 
     def own(self, key: str) -> Any:
         """A key's value in the configuration or the plant; None where it has none."""
         data, name = self._config, key
         if key.startswith(PLANT):
-            data, name = pickle.loads(self._plants(self._plant_of(self._config))), key[len(PLANT) :]
+            data, name = self._plants(self._plant_of(self._config)), key[len(PLANT) :]
         place: Any = data
         for part in name.split("."):
             if isinstance(place, list):
@@ -99,9 +99,9 @@ class Stand:
 
     def _setup(self, settings: Settings) -> Setup:
         """The designed controller of some settings of the configuration."""
-        key = pickle.dumps(settings)
+        key = repr(settings)  # tells 1 from 1.0 and True, which are equal
         if key not in self._setups:
-            data: dict[str, Any] = pickle.loads(pickle.dumps(self._config))
+            data: dict[str, Any] = deepcopy(self._config)
             for name, value in settings.items():
                 put(data, name, value, self.path.parent, "config")
             config = validate(data, RunConfig, "config", self.path.parent)
@@ -114,7 +114,7 @@ class Stand:
     def _plant(self, setup: Setup, settings: Settings, seed: int | None) -> tuple[PlantConfig, Wire]:
         name = setup.config.emulator.plant if setup.config.emulator else self._plant_of({})
         folder = (self.path.parent / name).parent
-        data: dict[str, Any] = pickle.loads(self._plants(name))
+        data: dict[str, Any] = deepcopy(self._plants(name))
         if seed is not None:
             data["seed"] = seed
         for key, value in settings.items():

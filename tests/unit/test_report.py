@@ -190,7 +190,7 @@ def test_what_cannot_be_reported_is_one_clear_refusal(
     for args, said in (
         ([str(foreign)], "is no log of hil"),
         ([str(tmp_path / "none.mcap")], "no such file"),
-        ([str(foreign), "-o", "out.pdf"], "name it .html or .png"),
+        ([str(foreign), "-o", "out.pdf"], "out.pdf: must end in .html or .png; name another file"),
         ([str(foreign)] * 9, "at most 8"),
     ):
         assert main(["report", *args]) == 2
