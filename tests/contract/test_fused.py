@@ -27,6 +27,7 @@ from hil import fused
 from hil.app import Overrides, Setup, header_of, load_setup
 from hil.clock import RealClock
 from hil.guardian import ARMED, BEAT_NS, COUNTER, FIRED, GUARD_NS, GUARDIAN_LOST_NS, GuardedDrive, Words
+from hil.log.check import first_broken
 from hil.log.reader import Log, open_log
 from hil.log.recorder import Recorder, open_recorder
 from hil.loop import (
@@ -304,9 +305,11 @@ def assert_same(rules: Ran, compiled: Ran) -> None:
     assert (compiled.ended, compiled.failure) == (rules.ended, rules.failure)
     assert len(compiled.log.ticks) == len(rules.log.ticks)
     for one in FIELDS:
-        if one.name not in STAMPS:
+        if one.name not in STAMPS | {"check"}:
             theirs, ours = rules.log.ticks[one.name], compiled.log.ticks[one.name]
             assert theirs.tobytes() == ours.tobytes(), one.name
+    for ran in (rules, compiled):  # the check is of the stamps too: each must fit its own
+        assert first_broken(ran.log.ticks, ran.log.absent) is None and ran.log.ticks["check"].all()
     at = [ran.log.ticks["t_ns"] - ran.log.ticks["t_ns"][0] for ran in (rules, compiled)]
     assert (at[0] == at[1]).all()
     passed = [[(f.can_id, f.data, f.received) for f in ran.log.frames] for ran in (rules, compiled)]
