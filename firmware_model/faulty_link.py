@@ -10,9 +10,9 @@ import random
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-from drivers.bus import Frame, Link
+from drivers.bus import Frame, Link, SocketLink
 from drivers.codec import Database, Message
-from drivers.local import ERR_FLAG
+from drivers.local import ERR_FLAG, pack_frame
 from drivers.lockstep import tick_over
 from firmware_model.faults import (
     BrownOut,
@@ -137,7 +137,8 @@ class FaultyLink:
         self._acted.update(place for place, _ in silent)
         if any(isinstance(fault, BusOff) for _, fault in silent) and not self._said_bus_off:
             self._said_bus_off = True
-            self._link.send(BUS_OFF_ERROR, bytes(8))
+            if isinstance(self._link, SocketLink):  # laid out here: a link's send takes data frames alone
+                self._link.send_raw(memoryview(pack_frame(BUS_OFF_ERROR, bytes(8))))
         return bool(silent)
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:

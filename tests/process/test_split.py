@@ -16,6 +16,7 @@ import pytest
 from hil.app import Overrides, load_setup, run
 from hil.cli import main
 from hil.demo import emulator_process
+from hil.log.check import seal
 from hil.log.errors import LogError
 from hil.log.parts import grouped
 from hil.log.reader import open_log
@@ -30,20 +31,26 @@ from tests.logfiles import HEADER, some_frames, some_ticks
 from tests.process.test_run import flags, hil
 
 pytestmark = pytest.mark.process
+AT_ONCE = "stop.ramp_rad_s2=0.0"
+"""No ramp before the stop, which would make the run longer."""
 Settings = Callable[..., tuple[str, ...]]
 
 
 @pytest.fixture(scope="module")
 def whole() -> Any:
     """Three seconds and a bit, simulated without a log."""
-    return simulate_ticks(load_setup(CONFIGS / "demo.toml", Overrides(settings=("loop.duration_s=3.2",))))
+    ticks = simulate_ticks(
+        load_setup(CONFIGS / "demo.toml", Overrides(settings=("loop.duration_s=3.2", AT_ONCE)))
+    )
+    seal(ticks)  # what the log's writer adds
+    return ticks
 
 
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The same as parts of a second."""
     folder = tmp_path_factory.mktemp("parts")
-    settings = ("loop.duration_s=3.2", "log.split_s=1.0", f'log.folder="{folder}"', 'log.name="a"')
+    settings = ("loop.duration_s=3.2", AT_ONCE, "log.split_s=1.0", f'log.folder="{folder}"', 'log.name="a"')
     simulate(load_setup(CONFIGS / "demo.toml", Overrides(settings=settings)), [])
     return sorted(folder.glob("*.mcap"))
 
@@ -103,10 +110,10 @@ def test_commands_take_parts_as_one_run(parts: list[Path], whole: Any, tmp_path:
 def test_another_controller_over_the_parts_is_as_over_the_whole(
     parts: list[Path], whole: Any, tmp_path: Path, capsys: Any
 ) -> None:
-    settings = ("loop.duration_s=3.2", f'log.folder="{tmp_path}"', 'log.name="one"')
+    settings = ("loop.duration_s=3.2", AT_ONCE, f'log.folder="{tmp_path}"', 'log.name="one"')
     one = simulate(load_setup(CONFIGS / "demo.toml", Overrides(settings=settings)), [])["log"]
     new = tmp_path / "new.toml"
-    text = (CONFIGS / "demo.toml").read_text().replace("delay_ms = 12.0", "delay_ms = 40.0")
+    text = (CONFIGS / "demo.toml").read_text().replace("delay_ms = 22.0", "delay_ms = 40.0")
     new.write_text(text.replace('"drives/', f'"{CONFIGS}/drives/'))
     found = []
     for name, logs in (("a", [one]), ("b", [str(path) for path in reversed(parts)]), ("c", [str(parts[2])])):
@@ -207,7 +214,9 @@ def test_a_run_on_the_bus_in_parts(configs: Path, settings: Settings, tmp_path: 
     """The same ticks and frames as the run in one file, the writer splitting beside the loop."""
     logs = []
     for more in (("log.split_s=1.0",), ()):
-        own = settings('loop.clock="lockstep"', "loop.duration_s=2.5", f'log.name="x{len(logs)}"', *more)
+        own = settings(
+            'loop.clock="lockstep"', "loop.duration_s=2.5", AT_ONCE, f'log.name="x{len(logs)}"', *more
+        )
         overrides = Overrides(settings=own)
         setup = load_setup(configs / "demo.toml", overrides)
         with emulator_process(configs / "demo.toml", overrides):
