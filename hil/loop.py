@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from hil.ports import Clock, Drive, Inbox, Recorder
-from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell
+from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell, ticks_from
 from hil.trouble import TROUBLE, Trouble
 
 Pacing = Literal["sync", "feedback", "timer"]
@@ -273,7 +273,7 @@ class Loop:
         t.recorded_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
         if t.reason[0]:
             if self._outcome.stop is None:
-                self._outcome.stop = self._ticks.copy()
+                self._outcome.stop = ticks_from(self._ticks.tobytes())  # .copy() goes field by field
             self._outcome.state, self._outcome.reason = t.state[0], t.reason[0]
             self._ended = t.state[0] in ENDED
 
