@@ -61,6 +61,7 @@ def test_every_member_is_tried_here() -> None:
 @pytest.mark.parametrize(
     ("law", "observer"), [(law, "ftdob") for law in LAWS] + [("cascade", o) for o in OBSERVERS]
 )
+@pytest.mark.compiled  # a whole run: interpreted it takes minutes
 def test_runs_in_simulate_and_replays_to_the_bit(tmp_path: Path, law: str, observer: str) -> None:
     setup = load_setup(DEMO, Overrides(settings=(*settings(law, observer), f'log.folder="{tmp_path}"')))
     result = simulate(setup, [])
@@ -69,6 +70,7 @@ def test_runs_in_simulate_and_replays_to_the_bit(tmp_path: Path, law: str, obser
 
 
 @pytest.mark.parametrize("law", LAWS)
+@pytest.mark.compiled  # a whole run: interpreted it takes minutes
 def test_every_law_holds_the_load(law: str) -> None:
     ticks = simulate_ticks(load_setup(DEMO, Overrides(settings=settings(law))))
     assert Reason(int(ticks["reason"][-1])) == Reason.STOP_REQUESTED
