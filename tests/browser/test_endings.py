@@ -70,7 +70,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Logs:
 
 
 SAID = {
-    "trip": ("the run ended in a trip, over speed; its last tick is at 0.9",),
+    "trip": ("the run ended in a trip, over speed: too fast: 70.", "; its last tick is at 0.9"),
     "controller": ("the controller died, what it had handed over was still written; its last tick",),
     "writer": (
         "how the run ended is not known, its log breaks off",

@@ -90,7 +90,8 @@ def test_a_spike_of_one_tick_is_drawn_at_every_zoom(
 
 def test_nothing_of_a_log_runs(page: Page, setup: Setup, ticks: TickArray, tmp_path: Path) -> None:
     header = header_of(setup, "run", "lockstep")
-    header["metadata"] = {name: value + EVIL for name, value in header["metadata"].items()}
+    kept = header["metadata"]["format"]  # another format is refused
+    header["metadata"] = {name: value + EVIL for name, value in header["metadata"].items()} | {"format": kept}
     header["metadata"][EVIL] = EVIL
     header["attachments"]["config.toml"] = EVIL
     header["attachments"][EVIL] = EVIL

@@ -2,7 +2,7 @@
 // Live plots of a run from the WebSocket beside this page. The next run comes by itself; the next server has
 // another address: nothing is asked with this one's token once it has gone, since anybody may have its port.
 (() => {
-  const KEPT_S = 30, HEIGHT = 190, 
+  const KEPT_S = 30, HEIGHT = 190;
   const PLOTS = [
     ["speed [rad/s]", [["w", "measured"], ["w_ref", "reference"]]],
     ["current [A]", [["i_q", "q"], ["i_q_ref", "q asked"], ["i_d", "d"]]],
