@@ -7,6 +7,7 @@ people to read (reports, exports) follows the umask.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -27,6 +28,8 @@ Settings = Callable[..., tuple[str, ...]]
 OTHERS = 0o077
 BUSES = IPv4Network("239.192.0.0/14")
 """Multicast groups of ``hil-local``: joined on loopback alone, sent with TTL 0."""
+CLAIM = re.compile("@hil-drive/[0-9a-f]{64}")
+"""A name in the kernel that a process holds and never accepts at: see hil/claim.py."""
 LISTENS = "0A"
 NO_SUCH_USER = 65534
 
@@ -178,7 +181,8 @@ def test_sockets_are_of_this_machine_alone(bench: Bench) -> None:
     assert len(udp) >= 6, "emulator, controller and guardian, each with one to send and one to receive"
     assert all(one.is_loopback or one in BUSES for one in udp)
     assert not [row for table in ("tcp6", "udp6") for row in rows(table) if row[9] in own]
-    assert not [row for row in rows("unix") if row[6] in own and len(row) > 7], "no socket with a name"
+    named = {row[7] for row in rows("unix") if row[6] in own and len(row) > 7}
+    assert named and all(CLAIM.fullmatch(name) for name in named), "claims of identifiers: nobody reads them"
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to start a process of another user")

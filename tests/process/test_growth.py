@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.process, pytest.mark.compiled]
 TICKS, SETTLED = 1900, 300  # the drive never enables: the run ends itself after 2000
 
 
-def answering(peer: Link, answers: list[bytes]) -> int:
+def answering(peer: Link, answers: list[bytes], statuses: list[bytes]) -> int:
     """A process that answers each SYNC; its id."""
     pid = os.fork()
     if pid == 0:
@@ -32,6 +32,8 @@ def answering(peer: Link, answers: list[bytes]) -> int:
             frame = peer.receive(10**9)
             if frame is not None and frame.can_id == 0x80:
                 k += 1
+                if k % 10 == 1:
+                    peer.send(0x281, statuses[k // 10 % 16])
                 peer.send(0x181, answers[k % 16])
     return pid
 
@@ -48,6 +50,8 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str, compiled: bo
     client = DriveClient(link, setup.database, on_frames=recorder.frames)
     feedback = setup.database.message("FEEDBACK")
     answers = [feedback.encode({"Counter": k, "State": 1}) for k in range(16)]
+    status = setup.database.message("STATUS")
+    statuses = [status.encode({"Counter": k, "DcLinkVoltage": 540.0}) for k in range(16)]
     seen: list[tuple[int, int]] = []
     plan, step = Plan(1_000_000, 800_000, "sync", TICKS), machine.looped()
     count = left = 0
@@ -66,7 +70,7 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str, compiled: bo
 
         return whole
 
-    drive = answering(peer, answers)
+    drive = answering(peer, answers, statuses)
     loop = Loop(client, clock, recorder, step, recorder.record, plan, StopRequest(), looked)
     gc.collect()
     gc.disable()
