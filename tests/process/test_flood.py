@@ -202,9 +202,22 @@ def test_a_flood_of_our_own_identifiers_ends_in_a_stop_that_tells_why(
 
 
 def test_a_bus_that_is_flooded_from_the_beginning_never_sees_a_voltage(begin: Callable[[], Bench]) -> None:
-    """Forged heartbeats and answers look like a drive; what comes with them ends the run."""
+    """Forged commands are another controller's: the run hears them, sends nothing, and says so in a line."""
     bench = begin()
     bench.node.flood(datagrams(3, *KINDS), 60.0, bursts=True, goes_on=bench.goes_on)
+    out, said = bench.run.communicate(timeout=60)
+    bench.node.listen(0.3)
+    assert bench.run.returncode == 2 and not out, said
+    assert "another controller sends 0x" in said and "nothing was sent" in said and "Traceback" not in said
+    assert not bench.commands()
+    bench.assert_drive_is_at_rest()
+
+
+def test_a_flood_of_answers_from_the_beginning_never_sees_a_voltage(begin: Callable[[], Bench]) -> None:
+    """Forged heartbeats and answers look like a drive; what comes with them ends the run."""
+    bench = begin()
+    kinds = tuple(kind for kind in KINDS if kind.__name__ not in ("orders", "foreign"))
+    bench.node.flood(datagrams(3, *kinds), 60.0, bursts=True, goes_on=bench.goes_on)
     code, result = bench.ended()
     print(f"{bench.node.sent} frames, {result['ended']}")
     assert code == 1 and result["log_complete"]
