@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.law import MotorModel
-from hil.signals import DriveState, TickArray
+from hil.signals import DriveState, Request, TickArray
 
 RECOVERED_RAD_S = 0.5
 
@@ -65,10 +65,13 @@ def tracking_rms(ticks: TickArray) -> float:
 
 
 def find_step(ticks: TickArray, at_least: float = 0.5) -> int | None:
-    """Row of the largest jump of the true load torque [N m] between two ticks, None for none."""
+    """Row of the largest jump of the true load torque [N m] between two ticks, None for none.
+
+    None counts once a stop was asked for: friction and brakes let go as the shaft comes to rest.
+    """
     if len(ticks) < 2:
         return None
-    jump = np.abs(np.diff(ticks["T_L_true"]))
+    jump = np.where(ticks["request"][1:] < Request.RAMP_DOWN, np.abs(np.diff(ticks["T_L_true"])), np.nan)
     if not np.isfinite(jump).any():
         return None
     row = int(np.nanargmax(jump)) + 1
