@@ -127,10 +127,10 @@ def radius(guard: Guard) -> float:
 
 
 def check_size(guard: Guard, before: Command, sent: Command, seen: str) -> None:
-    """Circle, step and load limit; the rounding to the wire may add half a step to each axis."""
+    """Circle, step and load limit; within the circle rounding to the wire may add half a step to each axis."""
     p = guard.p[0]
     shrinks = math.hypot(before[0], before[1]) > radius(guard)
-    assert shrinks or math.hypot(sent[0], sent[1]) <= radius(guard) + LSB * math.sqrt(0.5) + SLACK, seen
+    assert shrinks or math.hypot(sent[0], sent[1]) <= radius(guard) + SLACK, seen
     assert abs(sent[0] - before[0]) <= p["du_max"] + LSB / 2 + SLACK, seen
     assert abs(sent[1] - before[1]) <= p["du_max"] + LSB / 2 + SLACK, seen
     assert abs(sent[2]) <= p["T_L_max"] + LSB / 2 + SLACK, seen
@@ -154,5 +154,7 @@ def check_marks(guard: Guard, asked: Command, before: Command, sent: Command, fl
     assert bool(flags & GuardFlag.LOAD_TORQUE) == (abs(asked[2]) > p["T_L_max"]), seen
     part = p["du_max"] / far if far > p["du_max"] else 1.0
     for axis in (0, 1):
-        assert abs(sent[axis] - before[axis] - part * way[axis]) <= LSB / 2 + SLACK, seen
+        assert abs(sent[axis] - before[axis] - part * way[axis]) < LSB + SLACK, (
+            seen
+        )  # toward zero at the circle
     assert abs(sent[2] - min(max(asked[2], -p["T_L_max"]), p["T_L_max"])) <= LSB / 2 + SLACK, seen
