@@ -127,7 +127,7 @@ def radius(guard: Guard) -> float:
 
 
 def check_size(guard: Guard, before: Command, sent: Command, seen: str) -> None:
-    """Circle, step and load limit; within the circle rounding to the wire may add half a step to each axis."""
+    """Circle, step and load limit; in the circle rounding to the wire may add half a step to each axis."""
     p = guard.p[0]
     shrinks = math.hypot(before[0], before[1]) > radius(guard)
     assert shrinks or math.hypot(sent[0], sent[1]) <= radius(guard) + SLACK, seen
