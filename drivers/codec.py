@@ -265,7 +265,7 @@ class Database:
         return self._statements.blocks.keys()
 
     @cached_property
-    def _by_id(self) -> dict[int, str]:
+    def by_id(self) -> dict[int, str]:
         """Name by identifier as it stands in a frame; where two meet after moving the first counts."""
         out: dict[int, str] = {}
         for raw_id, names in self._names.items():
@@ -276,7 +276,7 @@ class Database:
 
     def of_frame(self, send_id: int) -> Message | None:
         """The message of an identifier as it stands in a frame, None when there is none that can be used."""
-        name = self._by_id.get(send_id)
+        name = self.by_id.get(send_id)
         return self.messages.get(name) if name else None
 
     def message(self, name: str, *signals: str) -> Message:

@@ -217,6 +217,15 @@ def frame_time(config: RunConfig) -> Callable[[int, bool], float]:
     return seconds
 
 
+def message_names(config: RunConfig | None, dbc: str) -> dict[int, str]:
+    """Message names by identifier as it stands in a frame, from a DBC's text; empty where it is none."""
+    node, rule = (config.drive.node_id, config.drive.node_rule) if config else (1, "")
+    try:
+        return dict(Database(Path("drive.dbc"), node, rule, dbc).by_id)
+    except DriverError:
+        return {}
+
+
 def is_emulated_bus(config: RunConfig) -> bool:
     """True for buses that no real drive hangs on: hil-local, python-can's virtual, vcan by the kernel's word.
 

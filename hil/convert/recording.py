@@ -19,12 +19,12 @@ from typing import IO, Final
 import numpy as np
 
 from hil.convert.periods import Heard
-from hil.convert.readers import asc, candump, library, mf4, trc
+from hil.convert.readers import asc, blf, candump, library, mf4, trc
 from hil.convert.readers.recorded import ERROR, REMOTE, Found, NotThisFormatError, Recorded
 from hil.log.errors import LogError
 
 TEXTS: Final = {".log": candump.read, ".asc": asc.read, ".trc": trc.read}
-BINARIES: Final = {".blf": library.read_blf, ".mf4": mf4.read}
+BINARIES: Final = {".blf": blf.read, ".mf4": mf4.read}
 TABLES: Final = (".csv", ".db")
 """python-can's own two, by python-can."""
 ENDINGS: Final = (*TEXTS, *BINARIES, *TABLES, *(f"{ending}.gz" for ending in (*TEXTS, *BINARIES)))

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.app import frame_time
+from hil.app import frame_time, message_names
 from hil.config import RunConfig, validate
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
@@ -18,7 +18,7 @@ from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
 from hil.report.excursions import Excursions
-from hil.report.frames import Frames, FrameTime, names_of
+from hil.report.frames import Frames, FrameTime
 from hil.report.segments import Responses
 from hil.report.statistics import Phases, Spectrum, Totals
 from hil.signals import DriveState, TickArray
@@ -142,8 +142,7 @@ class Run:
 
     def message_names(self) -> dict[int, str]:
         """Names of CAN identifiers by the log's own DBC."""
-        node_id = self.config.drive.node_id if self.config else 1
-        return names_of(self.log.attachments.get("drive.dbc", ""), node_id)
+        return message_names(self.config, self.log.attachments.get("drive.dbc", ""))
 
     def bus_load(self) -> tuple[float, float] | None:
         """Mean and busiest second [%]."""

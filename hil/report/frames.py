@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
@@ -13,6 +12,7 @@ from hil.log.schema import Records
 
 MOST_IDS: Final = 200
 EXTENDED: Final = 0x8000_0000
+REMOTE: Final = 0x4000_0000
 ERROR: Final = 0x2000_0000
 FrameTime = Callable[[int, bool], float]
 """Longest time on the bus [s] of a frame of that many bytes; True for an extended identifier."""
@@ -92,18 +92,9 @@ class Frames:
         return 100.0 * sum(busy.values()) / span_s, 100.0 * max(busy.values())
 
 
-def names_of(dbc: str, node_id: int) -> dict[int, str]:
-    """Message names by identifier, from a DBC's text; CANopen identifiers of node 1 move to the node's."""
-    out = {}
-    for raw, name in re.findall(r"^BO_ (\d+) (\w+)\s*:", dbc, re.MULTILINE):
-        number = int(raw)
-        moved = number < 0x800 and number & 0x7F == 1
-        out[number - 1 + node_id if moved else number] = name
-    return out
-
-
 def id_text(can_id: int) -> str:
     """An identifier in hex, as candump prints it."""
     if can_id & ERROR:
         return f"error {can_id & 0x1FFF_FFFF:X}"
-    return f"{can_id & 0x1FFF_FFFF:08X}" if can_id & EXTENDED else f"{can_id & 0x7FF:03X}"
+    text = f"{can_id & 0x1FFF_FFFF:08X}" if can_id & EXTENDED else f"{can_id & 0x7FF:03X}"
+    return f"{text} remote" if can_id & REMOTE else text

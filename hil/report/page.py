@@ -28,7 +28,7 @@ from hil.report.criteria import (
 )
 from hil.report.curves import PLOTS, limits_text
 from hil.report.embed import MOST_EVENTS, charts, is_empty, report_data, script_json
-from hil.report.frames import id_text
+from hil.report.frames import REMOTE, id_text
 from hil.report.segments import Response
 from hil.report.statistics import SPECTRUM_FIELDS
 
@@ -194,7 +194,7 @@ def traffic(run: Run) -> str:
         rows.append(
             (
                 id_text(can_id),
-                escape(names.get(can_id & 0x1FFF_FFFF, "")),
+                escape(names.get(can_id & ~REMOTE, "")),
                 way,
                 str(t.count),
                 length,

@@ -18,6 +18,8 @@ from typing import Any
 import can
 import numpy as np
 
+from tests import blf
+
 HERE = Path(__file__).parent
 ZONE = {"TZ": "UTC", "LC_ALL": "C", "PATH": "/usr/bin:/bin"}
 
@@ -108,6 +110,30 @@ def python_can() -> None:
             writer(message)
 
 
+def vector_blf() -> None:
+    """The objects of Vector's own loggers, by hand: errors of three kinds, requests before what was sent."""
+    start = round(messages()[0].timestamp * 1e6) // 1000 * 1_000_000
+    errors = iter([(2, blf.error()), (73, blf.error_ext(0x204, b"", 1)), (104, blf.fd_error(0x204, b"\1"))])
+    objects = []
+    for at, message in enumerate(messages()):
+        t_ns = round(message.timestamp * 1e6) * 1000 - start
+        number = message.arbitration_id | (blf.EXTENDED if message.is_extended_id else 0)
+        way, data = blf.RECEIVED if message.is_rx else blf.SENT, bytes(message.data)
+        if message.is_error_frame:
+            kind, body = next(errors)
+            objects.append(blf.of(kind, t_ns, body))
+        elif message.is_fd:
+            objects.append(blf.of(101, t_ns, blf.fd_64(number, data, way=way)))
+        else:
+            if way == blf.SENT:
+                objects.append(blf.of(1, t_ns - 1000, blf.message(number, data, way=blf.REQUESTED)))
+            body = blf.message(number, data, way=way, remote=message.is_remote_frame, dlc=message.dlc)
+            objects.append(blf.of(86, t_ns, body + bytes(8)) if at % 2 else blf.of(1, t_ns, body, version=2))
+    whole = b"".join([*objects[:1], blf.of(4, 0, bytes(40)), *objects[1:]])
+    parts = [blf.container(whole[at : at + 4000]) for at in range(0, len(whole), 4000)]
+    (HERE / "vector.blf").write_bytes(blf.file_of(*parts))
+
+
 def asammdf_without_ide() -> None:
     """The members that ASAM's bus logging demands, and no others."""
     import asammdf
@@ -152,5 +178,5 @@ def peak() -> None:
 
 
 if __name__ == "__main__":
-    for make in (candump, can_utils, vector, python_can, asammdf_without_ide, peak):
+    for make in (candump, can_utils, vector, vector_blf, python_can, asammdf_without_ide, peak):
         make()

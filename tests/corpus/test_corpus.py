@@ -65,12 +65,26 @@ def test_through_import_export_and_back(name: str, tmp_path: Path) -> None:
 
 def bodies(name: str) -> list[tuple[int, bytes]]:
     """Identifier and data of each frame of a recording."""
-    return [(one.can_id, one.data) for one in Recording(HERE / name, BASE["channel"]).frames()]
+    return [
+        (one.can_id, one.data)
+        for one in Recording(HERE / name, {**BASE, **TABLE.get(name, {})}["channel"]).frames()
+    ]
 
 
 @pytest.mark.parametrize("name", ["candump-l.log", "candump-L-x.log", "candump-L-8.log", "candump-any.log"])
 def test_what_candump_wrote_is_all_there(name: str) -> None:
     assert bodies(name) == bodies("base.log")
+
+
+def test_of_vectors_own_loggers_everything_is_there_but_what_errors_were() -> None:
+    assert Recording(HERE / "vector.blf").notes == [
+        "61 transmit requests (TxRq) left out: what was sent is there as Tx"
+    ]
+    wanted = [
+        (0x20000080, bytes(8)) if number & 0x20000000 else (number, data)
+        for number, data in bodies("base.log")
+    ]
+    assert bodies("vector.blf") == wanted
 
 
 @pytest.mark.parametrize("name", ["python-can.blf", "out-of-order.blf", "python-can.mf4"])

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
+from hil.app import Overrides, load_setup, message_names
 from hil.cli import main
 from hil.config import RunConfig, load_toml
 from hil.errors import ConfigError
+from hil.log.schema import FRAME
 from hil.report.collect import collect
 from hil.report.criteria import judge
 from hil.report.curves import KEYS
 from hil.report.embed import script_json
 from hil.report.envelope import BEFORE, CloseUps, Envelope, merged
-from hil.report.frames import Frames, names_of
+from hil.report.frames import ERROR, EXTENDED, REMOTE, Frames, id_text
+from hil.report.page import traffic
 from hil.report.segments import Responses, last_outside
 from hil.report.statistics import Histogram, Spectrum
 from hil.signals import DriveState, new_ticks
@@ -148,7 +151,34 @@ def test_frames_are_counted_and_the_bus_load_is_a_share_of_time() -> None:
     assert own.traffic[0x181, True].shortest == own.traffic[0x181, True].longest == 2.0
     load = own.load(lambda length, extended: 1e-4 if length == 8 and not extended else 0.0)
     assert load == (pytest.approx(10.0, rel=1e-3), pytest.approx(10.0))
-    assert names_of("BO_ 385 FEEDBACK: 8 X\nBO_ 128 SYNC: 1 X", 3) == {0x183: "FEEDBACK", 0x80: "SYNC"}
+
+
+OF_NODE_1 = "BO_ 385 FEEDBACK: 8 X\n\nBO_ 128 SYNC: 1 X\n\nBO_ 2147483777 OWN: 1 X\n\nBO_ 1 OTHER: 1 X\n"
+NAMED: dict[tuple[int, str], dict[int, str]] = {
+    (3, ""): {0x183: "FEEDBACK", 0x80: "SYNC", 0x80000081: "OWN", 0x001: "OTHER"},
+    (3, "id << 0 : 4"): {0x183: "FEEDBACK", 0x83: "SYNC", 0x80000083: "OWN", 0x003: "OTHER"},
+    (200, ""): {},
+}
+
+
+@pytest.mark.parametrize("node", NAMED)
+def test_messages_have_their_names_by_the_rule_by_which_a_run_moves_them(node: tuple[int, str]) -> None:
+    config = load_toml(Path("configs/demo.toml"), RunConfig)
+    drive = config.drive.model_copy(update={"node_id": node[0], "node_rule": node[1]})
+    assert message_names(config.model_copy(update={"drive": drive}), OF_NODE_1) == NAMED[node]
+    assert message_names(None, "") == {}
+
+
+def test_what_is_no_data_frame_has_no_messages_name(log: Path) -> None:
+    run = collect(log, verify=False)
+    records = np.zeros(4, FRAME)
+    records["can_id"] = [0x80, ERROR | 0x80, EXTENDED | 0x80, REMOTE | 0x80]
+    run.frames.feed(records)
+    rows = re.findall(r"<tr>.*?</tr>", traffic(run))[1:]
+    assert [re.findall(r"<td[^>]*>(.*?)</td>", row)[:2] for row in rows] == [
+        ["080", "SYNC"], ["error 80", ""], ["080 remote", "SYNC"], ["00000080", ""],
+    ]  # fmt: skip
+    assert id_text(EXTENDED | REMOTE | 0x12) == "00000012 remote"
 
 
 def test_a_run_is_judged_by_its_config(log: Path) -> None:

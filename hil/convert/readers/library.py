@@ -1,16 +1,13 @@
-"""What python-can reads well: BLF, its own CSV and SQLite; here the flags, and whether a file is cut off."""
+"""What python-can reads well, its own CSV and SQLite; and how its messages become frames."""
 
 from __future__ import annotations
 
 import math
-import os
-import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Final, cast
+from typing import Any
 
 import can
-from can.io.blf import BLFParseError
 
 from hil.convert.readers.recorded import (
     Found,
@@ -20,9 +17,6 @@ from hil.convert.readers.recorded import (
     frame,
     identifier,
 )
-
-_HEADER: Final = struct.Struct("<4sL8BQ")
-_OBJECT: Final = struct.Struct("<4sHHLL")
 
 
 def of_messages(messages: Iterable[Any], found: Found) -> Iterator[Recorded]:
@@ -53,39 +47,6 @@ def stamp_ns(seconds: float) -> int:
     if not math.isfinite(seconds) or not -4e9 < seconds < 4e9:
         raise UnreadableError(f"the stamp {seconds:g} s is no time")
     return round(seconds * 1e6) * 1000
-
-
-def read_blf(file: IO[bytes], found: Found) -> Iterator[Recorded]:
-    """Frames of a BLF file, up to where it can be read. Raises NotThisFormatError."""
-    found.cut = missing_of_blf(file)
-    file.seek(0)
-    try:
-        yield from of_messages(can.BLFReader(cast("BinaryIO", file)), found)
-    except (BLFParseError, struct.error, ValueError, OverflowError, MemoryError) as error:
-        left = found.cut or f"the rest can't be read: {error or type(error).__name__}"
-        found.cut = f"after frame {found.places}: {left}"
-
-
-def missing_of_blf(file: IO[bytes]) -> str:
-    """What a BLF file lacks by its own header and by the sizes of its objects, in words; empty for none.
-
-    python-can 4.6.1 ends quietly where the bytes end. Raises NotThisFormatError.
-    """
-    size = file.seek(0, os.SEEK_END)
-    file.seek(0)
-    head = file.read(_HEADER.size)
-    if len(head) < _HEADER.size or head[:4] != b"LOGG":
-        raise NotThisFormatError("empty" if not size else f"not a BLF file: it begins with {head[:4]!r}")
-    fields = _HEADER.unpack(head)
-    told, at = fields[-1], fields[1]
-    while at + _OBJECT.size <= size:
-        file.seek(at)
-        signature, _, _, length, _ = _OBJECT.unpack(file.read(_OBJECT.size))
-        if signature != b"LOBJ" or length < _OBJECT.size:
-            return f"no object where one should begin: {size - at} of {size} bytes can't be read"
-        at += length + length % 4
-    missing = max(told - size, at - size if at > size + 3 else 0)
-    return f"cut off: at least {missing} of {size + missing} bytes are missing" if missing > 0 else ""
 
 
 def read_table(path: Path, found: Found) -> Iterator[Recorded]:
