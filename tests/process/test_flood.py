@@ -205,7 +205,7 @@ def test_a_flood_of_our_own_identifiers_ends_in_a_stop_that_tells_why(
 def test_a_bus_that_is_flooded_from_the_beginning_never_sees_a_voltage(begin: Callable[[], Bench]) -> None:
     """Forged commands are another controller's: the run hears them, sends nothing, and says so in a line."""
     bench = begin()
-    bench.node.flood(datagrams(3, *KINDS), 60.0, bursts=True, goes_on=bench.goes_on)
+    bench.node.flood(datagrams(3, orders, twin, foreign), 60.0, bursts=True, goes_on=bench.goes_on)
     out, said = bench.run.communicate(timeout=60)
     bench.node.listen(0.3)
     assert bench.run.returncode == 2 and not out, said

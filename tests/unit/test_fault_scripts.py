@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.bus import Frame
+from drivers.bus import BusSettings, Frame, open_link
 from drivers.codec import Database
 from drivers.local import ERR_FLAG
 from drivers.lockstep import TICK_OVER, LockstepLink, tick_over
@@ -132,15 +133,25 @@ def test_a_frozen_counter_has_a_good_crc() -> None:
     assert all(FEEDBACK.valid(frame.data) for frame in bench.ends.sent)
 
 
-def test_bus_off_is_told_by_one_error_frame_and_cuts_both_directions() -> None:
-    bench = Bench({"kind": "bus-off", "at_s": 0.0, "for_s": 0.002})
-    bench.ends.waiting = [Frame(0x201, bytes(8), 0, False)]
-    bench.feedback(0)
-    assert bench.link.receive(0) is None and bench.ends.waiting == []
-    bench.feedback(1)
-    assert [(f.can_id, f.flags) for f in bench.ends.sent] == [(0x40, ERR_FLAG)]
-    bench.feedback(2)
-    assert bench.ends.sent[-1].can_id == FEEDBACK.can_id
+def test_bus_off_is_told_by_one_error_frame_and_cuts_both_directions(channel: str) -> None:
+    settings = BusSettings("hil-local", channel)
+    with closing(open_link(settings)) as node, closing(open_link(settings)) as other:
+        bench = Bench({"kind": "bus-off", "at_s": 0.0, "for_s": 0.002})
+        bench.link = FaultyLink(
+            node, DATABASE, faults({"kind": "bus-off", "at_s": 0.0, "for_s": 0.002}), lockstep=False
+        )
+        bench.link.now_ns = lambda: bench.t_ns
+        other.send(0x201, bytes(8))
+        bench.feedback(0)
+        assert bench.link.receive(1_000_000) is None, "the command is cut"
+        for counter in (1, 2):
+            bench.feedback(counter)
+        heard = [other.receive(100_000_000) for _ in range(2)]
+        assert [(frame.can_id, frame.flags) for frame in heard if frame] == [
+            (0x40, ERR_FLAG),
+            (FEEDBACK.can_id, 0),
+        ]
+        assert other.receive(0) is None
 
 
 def test_frames_to_the_drive_have_faults_too_and_a_lost_sync_lets_time_pass() -> None:
