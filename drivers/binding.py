@@ -22,7 +22,7 @@ from drivers.payload import NO_PAYLOAD, Layout
 from drivers.signal import Signal
 from drivers.units import FIRST, shown, unit_of
 
-__all__ = ["Binding", "Bound", "bind"]
+__all__ = ["MOST_COUNTS", "Binding", "Bound", "bind"]
 
 _COUNTER_PLACE = {2: (8, 4), 5: (16, 8)}
 

@@ -31,6 +31,7 @@ from drivers.frames import (
     FRESH,
     LENGTH_ERROR,
     SEND_FAILED,
+    SENT_FIELDS,
     SOURCES,
 )
 from drivers.jit import COMPILED, entry
@@ -69,7 +70,6 @@ _GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _D
 _MISSING_AT: Final = (STATE.names or ()).index("missing_at")
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
-_SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
 
 
 def _offset(tick: Any, name: str) -> int:
@@ -177,7 +177,7 @@ class DriveClient:
         self._translate = translator(self.binding.map.states, lambda: int(self._cells[_CONTROLWORD]))
         self._flags_cell, self._state_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_state")
         self._error_cell = cell_of(tick, "drive_error")
-        self._sent_cells = [cell_of(tick, name) for name in _SENT_FIELDS]
+        self._sent_cells = [cell_of(tick, name) for name in SENT_FIELDS]
         if self._port is not None:
             incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
             own = {"tick": raw, **incoming}
@@ -186,7 +186,7 @@ class DriveClient:
                 size = len(self._sync.view)
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
             if len(self._outgoing) == 1:
-                fields = np.array([_offset(tick, name) for name in _SENT_FIELDS], np.int64)
+                fields = np.array([_offset(tick, name) for name in SENT_FIELDS], np.int64)
                 own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": fields}
                 self._command = self._port.commander(own | self._commanding)
         self._tick = tick

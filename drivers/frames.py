@@ -28,6 +28,8 @@ SOURCES: Final = (
     "load_enable",
 )
 """Values of a command, in the order in which they are handed to the encoder."""
+SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
+"""Fields of a tick that make its command."""
 CONTROLWORD: Final = SOURCES.index("controlword")
 ENABLE_OPERATION: Final = 0x0F
 """The one controlword with which a drive may operate."""

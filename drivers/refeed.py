@@ -8,7 +8,8 @@ import numpy as np
 
 from drivers.frames import EMERGENCY, FRESH
 from drivers.jit import jit
-from drivers.wire import CLASSIC_BYTES, DATA_AT, FD_BYTES, STATE_RAW, take
+from drivers.posix import gather
+from drivers.wire import CLASSIC_BYTES, DATA_AT, FD_BYTES, REFUSED, STATE_RAW, encode, find, take
 
 
 @jit
@@ -31,8 +32,8 @@ def refeed(
     """Fill ``rows`` (n, bytes of a tick) and ``flags`` (n) with what n ticks must hold; frames used.
 
     ``limits``: when each tick was computed, on the frames' clock: what came later is another's. ``ids``: SYNC
-    that the controller sends (-1: none), its command, the drive's emergency (-1: none). ``counters``: of the
-    command of each tick, ``tick``: its bytes before the first.
+    that the controller sends (-1: none), its command, the drive's emergency (-1: none). ``counters`` (n + 1):
+    of the command before the first tick, then of each tick's; ``tick``: its bytes before the first.
     """
     at = 0
     for j in range(limits.shape[0]):
@@ -44,8 +45,8 @@ def refeed(
                 if can_id == ids[0]:
                     late, done = False, False
                     state[0]["got"] = 0
-                elif can_id == ids[1] and j > 0:
-                    state[0]["last_sent"] = counters[j - 1]
+                elif can_id == ids[1]:  # a clock of lockstep stands still from feedback to command
+                    state[0]["last_sent"] = counters[j + (frame["t_ns"] == limits[j])]
             elif can_id == ids[2] and frame["size"] == 8:
                 code = int(frame["data"][0]) | int(frame["data"][1]) << 8
                 tick[error_at : error_at + 4].view(np.uint32)[0] = code
@@ -60,3 +61,26 @@ def refeed(
         rows[j, :] = tick
         flags[j] = seen
     return at
+
+
+@jit
+def resend(
+    frames: Any, owners: Any, ticks: Any, fields: Any, values: Any, messages: Any, signals: Any, state: Any,
+    words: Any, raw: Any, log: Any, wrong: Any,
+) -> None:  # fmt: skip
+    """Set ``wrong`` (n frames) where a sent command's bytes are not those that its tick makes.
+
+    ``owners``: each frame's row of ``ticks`` (bytes of records), -1 for none; ``fields``: of
+    :func:`drivers.posix.gather`. Frames that the map does not send are not judged.
+    """
+    for row in range(frames.shape[0]):
+        frame = frames[row]
+        lay_out(frame, raw)
+        index = find(raw, messages)
+        if index < 0 or owners[row] < 0 or frame["received"]:
+            continue
+        gather(values, ticks[owners[row]], fields)
+        size = encode(raw, values, index, messages, signals, state, words, log, 0)
+        wrong[row] = size == REFUSED or int(frame["size"]) != messages[index]["length"]
+        for at in range(messages[index]["length"]):
+            wrong[row] |= raw[DATA_AT + at] != frame["data"][at]

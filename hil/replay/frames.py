@@ -24,7 +24,8 @@ from hil.config import RunConfig, validate
 from hil.errors import HilError
 from hil.log.reader import Log
 from hil.log.schema import Records
-from hil.replay.fold import ulp_between
+from hil.replay.fold import earliest, ulp_between
+from hil.replay.sent import SentCheck
 from hil.replay.verdict import Difference
 from hil.signals import FIELDS, TICK, RxFlag, TickArray, new_ticks
 
@@ -34,6 +35,8 @@ COMPARED_FLAGS = (
 _KINDS = {field.name: field.kind for field in FIELDS}
 BOUND_NS = 2**31 - 1
 """What a time of a tick is cut to."""
+END_NS = 2**63 - 1
+"""No frame comes later."""
 
 
 def binding_of(log: Log) -> tuple[Binding, RunConfig]:
@@ -52,7 +55,7 @@ def binding_of(log: Log) -> tuple[Binding, RunConfig]:
 
 
 class FrameCheck:
-    """Ticks and frames as they come; :meth:`difference` is the first tick that its frames contradict."""
+    """Ticks and frames as they come; ``difference`` is the first tick that its frames contradict."""
 
     def __init__(self, log: Log) -> None:
         self.difference: Difference | None = None
@@ -87,6 +90,8 @@ class FrameCheck:
         names |= {"echo"} | ({"drive_error"} if binding.emergency else set())
         if binding.map.states:
             names -= {"drive_state"}  # translated step by step from states of its own
+        self._sent = SentCheck(binding)
+        self._before = np.empty(0, np.int64)
         self._names = sorted(names & (set(_KINDS) - log.absent))
 
     def feed(self, kind: str, records: Records) -> None:
@@ -104,8 +109,12 @@ class FrameCheck:
 
     def finish(self) -> None:
         """Compare what is left: no more frames will come."""
-        if not self.note and self.difference is None and self._frames and self._ticks:
-            self._compare(2**63 - 1)
+        if self.note or self.difference is not None:
+            return
+        if self._frames and self._ticks:
+            self._compare(END_NS)
+        if self.difference is None and self._frames:
+            self.difference = self._sent.compare(np.empty(0, TICK), np.concatenate(self._frames), last=True)
 
     def _compare(self, until_ns: int) -> None:
         ticks = np.concatenate(self._ticks) if len(self._ticks) > 1 else self._ticks[0]
@@ -122,9 +131,14 @@ class FrameCheck:
         flags = np.zeros(count, np.int64)
         if not self._begun:  # what came before the first tick is not known
             self._tick[:] = ticks[:1]
-        given: Any = (frames, limits[:count], ticks["counter"].astype(np.int64), *self._kernel, rows, flags)
+            self._before = ticks["counter"][:1].astype(np.int64)
+        counters = np.concatenate((self._before, ticks["counter"][:count].astype(np.int64)))
+        given: Any = (frames, limits[:count], counters, *self._kernel, rows, flags)
         used = refeed(*given)
         self._judge(ticks[:count], rows.view(TICK)[:, 0], flags)
+        sent = self._sent.compare(ticks[:count], frames[:used], last=until_ns == END_NS)
+        self.difference = earliest(self.difference, sent)
+        self._before = counters[-1:]
         self.done_k = int(ticks["k"][count - 1])
         self._begun, self._ticks, self._frames = True, [ticks[count:]], [frames[used:]]
         self._frames = [part for part in self._frames if len(part)]

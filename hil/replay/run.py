@@ -147,7 +147,7 @@ def _run(replay: Replay, blocks: Iterable[tuple[str, Records]], seen: Callable[[
         if kind == "ticks" and more:
             more = replay.feed(records)
             seen(replay.ticks)
-        if replay.whole and not replay.impossible and len(records) and in_lockstep(replay.log):
+        if replay.whole and not replay.impossible and len(records):
             frames = frames or _frame_check(replay.log)
             frames.feed(kind, records)
         if not more and (frames is None or frames.over(replay.difference)):
@@ -157,11 +157,6 @@ def _run(replay: Replay, blocks: Iterable[tuple[str, Records]], seen: Callable[[
         if frames.difference is not None and complete_frames(replay.log):
             replay.difference = earliest(frames.difference, replay.difference)
     return replay.verdict()
-
-
-def in_lockstep(log: Log) -> bool:
-    """True where the frames' stamps say surely which tick each is of; a real clock's are not compared yet."""
-    return log.metadata.get("run", {}).get("clock") == "lockstep"
 
 
 def _frame_check(log: Log) -> FrameCheck:

@@ -158,6 +158,27 @@ def test_a_bit_of_a_received_payload_is_found(on_the_bus: Log) -> None:
         assert first is not None, (int(at), byte, bit)
 
 
+def test_a_bit_of_a_sent_payload_is_found(on_the_bus: Log) -> None:
+    """Also of the stop frames after the last tick."""
+    frames, rng = frame_records(on_the_bus.frames), np.random.default_rng(603)
+    sent = np.nonzero((frames["received"] == 0) & (frames["can_id"] == 0x201))[0]
+    for at in (*rng.choice(sent, 60), sent[-1], sent[-3]):
+        changed = frames.copy()
+        byte, bit = int(rng.integers(changed["size"][at])), int(rng.integers(8))
+        changed["data"][at, byte] ^= 1 << bit
+        first = checked(on_the_bus, on_the_bus.ticks, changed).difference
+        assert first is not None, (int(at), byte, bit)
+
+
+def test_a_changed_command_is_named(on_the_bus: Log) -> None:
+    """As if a tick had been changed whole, with its check made anew: its frame says what was sent."""
+    frames, ticks = frame_records(on_the_bus.frames), on_the_bus.ticks.copy()
+    ticks["u_q"][700] += 1.0
+    first = checked(on_the_bus, ticks, frames).difference
+    assert first is not None and (first.tick, first.field) == (700, "u_q")
+    assert first.logged - first.replayed == pytest.approx(1.0, abs=0.01)
+
+
 def test_a_changed_frame_is_a_verdict(on_the_bus: Log, tmp_path: Path) -> None:
     frames, path = frame_records(on_the_bus.frames), tmp_path / "a.mcap"
     at = int(np.nonzero(frames["can_id"] == 0x181)[0][500])
