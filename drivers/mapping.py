@@ -78,31 +78,57 @@ class DriveMap:
     """
 
     speed: str
+    """Mechanical speed w, or electrical, as its unit in the DBC says."""
     i_q: str
+    """Current i_q."""
     i_d: str
+    """Current i_d."""
     state: str
+    """State of the drive; see states."""
     u_q: str
+    """Voltage command u_q."""
     u_d: str
+    """Voltage command u_d."""
     controlword: str = ""
+    """CiA 402 controlword; or enable."""
     enable: str = ""
+    """One bit that enables the drive, where it has no controlword."""
     reset: str = ""
+    """One bit that resets a fault, beside enable."""
     echo: str = ""
+    """Counter of the command that the drive now applies."""
     limited: str = ""
+    """The drive limits the voltage itself."""
     v_dc: str = ""
+    """DC link."""
     error: str = ""
+    """Error code."""
     temperature_motor: str = ""
+    """Temperature of the motor."""
     temperature_inverter: str = ""
+    """Temperature of the inverter."""
     load_true: str = ""
+    """True load torque, of an emulator."""
     load_torque: str = ""
+    """Torque command to a load machine (kind fac)."""
     load_enable: str = ""
+    """Enable of the load machine."""
     sync: str = ""
+    """Message that begins the drive's cycle."""
     emergency: str = ""
+    """Emergency message of the drive."""
     heartbeat: str = ""
+    """Heartbeat of the drive."""
     counters: tuple[str, ...] = ()
+    """Frame counters, one for each message that has one."""
     constants: Mapping[str, int | float] = field(default_factory=dict)
+    """Signals that are always sent with a value, by MESSAGE.Signal."""
     units: Mapping[str, str] = field(default_factory=dict)
+    """Unit of a part or a MESSAGE.Signal for which the DBC has another, none or an unknown one."""
     pole_pairs: int | None = None
+    """Pole pairs, for electrical speeds."""
     states: Mapping[int, str] | str = field(default_factory=dict)
+    """CiA 402's name for each raw value of state, or "statusword"."""
 
 
 def house_map(database: Database) -> DriveMap:

@@ -36,13 +36,21 @@ class PlantMotor(Table):
     """The true motor."""
 
     name: str = ""
+    """What the motor is called, for reports."""
     R_s_ohm: Positive
+    """Resistance R_s of a phase."""
     L_d_h: Positive
+    """Inductance L_d of the d axis."""
     L_q_h: Positive
+    """Inductance L_q of the q axis."""
     psi_f_wb: Positive
+    """Flux linkage psi_f of the magnets: peak phase voltage over electrical speed."""
     n_p: Annotated[int, Field(ge=1, le=100)]
+    """Pole pairs n_p."""
     J_kg_m2: Positive
+    """Moment of inertia J of motor and load together."""
     B_f_n_m_s: NonNegative = 0.0
+    """Viscous friction B_f: torque over mechanical speed."""
 
 
 class Inverter(Table):
@@ -54,13 +62,21 @@ class Inverter(Table):
     """
 
     v_dc_v: Positive = 540.0
+    """DC link; with capacitance_f the no-load voltage of its rectifier."""
     resolution_v: NonNegative = 0.02
+    """Resolution of the modulator; 0: none."""
     capacitance_f: Positive | None = None
+    """Capacitor of the DC link; left out: the link stays at v_dc_v."""
     rectifier_ohm: Positive = 0.5
+    """Resistance of the rectifier that feeds the capacitor."""
     brake_ohm: Positive | None = None
+    """Brake resistor; left out: none."""
     brake_on_v: Positive | None = None
+    """DC link at which the brake resistor is switched on."""
     brake_off_v: Positive | None = None
+    """DC link at which the brake resistor is switched off again."""
     v_dc_trip_v: Positive | None = None
+    """DC link above which the drive trips; left out: it does not."""
 
     @model_validator(mode="after")
     def _whole(self) -> Inverter:
@@ -81,8 +97,11 @@ class Friction(Table):
     """Dry friction of the shaft: T = sgn(w) (T_c + (T_s - T_c) e^{-|w| / w_s}); it sticks up to T_s."""
 
     coulomb_n_m: NonNegative = 0.0
+    """Dry friction T_c of a shaft that slides."""
     static_n_m: NonNegative | None = None
+    """Largest torque T_s that holds a shaft at rest; left out: as coulomb_n_m."""
     stribeck_rad_s: Positive = 1.0
+    """Speed w_s with which friction falls from T_s to T_c."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Friction:
@@ -95,20 +114,30 @@ class Sensors(Table):
     """Standard deviation of the noise on speed and currents; resolution and range are the wire's."""
 
     w_noise_rad_s: NonNegative = 0.0
+    """Noise of the measured speed, standard deviation."""
     i_noise_a: NonNegative = 0.0
+    """Noise of the measured currents, standard deviation."""
 
 
 class Firmware(Table):
     """Protection of the drive itself."""
 
     watchdog_ms: Annotated[float, Field(ge=0, le=3.6e6, allow_inf_nan=False)] = 20.0
+    """Time without a fresh valid command after which the drive stops itself; 0: never."""
     i_trip_a: Positive = 30.0
+    """Current above which the drive trips."""
     w_trip_rad_s: Positive = 300.0
+    """Speed above which the drive trips."""
     temperature_trip_c: Positive = 140.0
+    """Temperature above which the drive trips."""
     ambient_c: Finite = 25.0
+    """Ambient temperature, and the motor's at the start."""
     thermal_resistance_k_w: Positive = 0.5
+    """Thermal resistance from winding to ambient."""
     thermal_time_s: Positive = 600.0
+    """Time constant of the winding's temperature."""
     status_every: Annotated[int, Field(ge=1, le=10**6)] = 10
+    """SYNCs from one status message to the next."""
 
 
 class ConstantLoad(Table):
@@ -116,6 +145,7 @@ class ConstantLoad(Table):
 
     kind: Literal["constant"]
     torque_n_m: Finite
+    """Torque, positive against positive speed."""
 
 
 class StepLoad(Table):
@@ -123,8 +153,11 @@ class StepLoad(Table):
 
     kind: Literal["step"]
     torque_n_m: Finite
+    """Torque, positive against positive speed."""
     at_s: Since
+    """When it comes [plant time]."""
     until_s: Since | None = None
+    """When it goes; left out: never."""
 
     @model_validator(mode="after")
     def _in_order(self) -> StepLoad:
@@ -138,8 +171,11 @@ class BrakeLoad(Table):
 
     kind: Literal["brake"]
     torque_n_m: NonNegative
+    """Torque of the brake while it slides; it holds up to this."""
     at_s: NonNegative = 0.0
+    """When it closes [plant time]."""
     until_s: Positive | None = None
+    """When it opens; left out: never."""
 
     @model_validator(mode="after")
     def _in_order(self) -> BrakeLoad:
@@ -153,8 +189,11 @@ class SineLoad(Table):
 
     kind: Literal["sine"]
     torque_n_m: Finite
+    """Amplitude."""
     frequency_hz: Positive
+    """Frequency."""
     phase_rad: Finite = 0.0
+    """Phase at plant time 0."""
 
 
 class FanLoad(Table):
@@ -162,6 +201,7 @@ class FanLoad(Table):
 
     kind: Literal["fan"]
     k_n_m_s2: Positive
+    """Coefficient k of w |w|."""
 
 
 class CouplerLoad(Table):
@@ -169,10 +209,15 @@ class CouplerLoad(Table):
 
     kind: Literal["coupler"]
     torque_at_zero_gap_n_m: Positive
+    """Largest torque over slip speed, at no air gap."""
     gap_mm: NonNegative
+    """Air gap."""
     decay_length_mm: Positive
+    """Air gap over which the field falls to 1/e: pole pitch / pi."""
     slip_at_max_rad_s: Positive
+    """Slip speed at which the torque is largest."""
     other_side_rad_s: Finite = 0.0
+    """Speed of the coupler's other side."""
 
 
 Load = Annotated[
@@ -184,7 +229,9 @@ class Disturbance(Table):
     """Unknown constants phi of (33)."""
 
     phi_w_rad_s2: Finite = 0.0
+    """Constant in the speed equation."""
     phi_q_a_s: Finite = 0.0
+    """Constant in the q current's equation."""
 
 
 def included(value: Any, info: ValidationInfo) -> Any:
@@ -201,21 +248,37 @@ class PlantConfig(Table):
     """The whole emulated drive."""
 
     dbc: str
+    """Path of the DBC that the drive speaks, relative to this file."""
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
+    """Number of the drive on the bus."""
     protocol: Literal["house", "inverter"] = "house"
+    """The house protocol (docs/protocol.md), or inverter: CAN FD, 29-bit identifiers, no SYNC and no echo."""
     pacing: Literal["sync", "cyclic"] = "sync"
+    """The drive answers SYNC, or sends by its own clock (cyclic)."""
     substep_us: Annotated[int, Field(ge=1, le=100_000)] = 500
+    """Longest step of the motor's Taylor series."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+    """Seed of the sensors' noise."""
     truth: bool = True
+    """Send the true load torque, for the report."""
     motor: Annotated[PlantMotor, BeforeValidator(included)]
+    """The true motor: a table, or the path of a file."""
     inverter: Inverter = Inverter()
+    """DC link and modulator."""
     sensors: Sensors = Sensors()
+    """Noise of the sensors."""
     firmware: Firmware = Firmware()
+    """Protection of the drive itself."""
     friction: Friction = Friction()
+    """Dry friction of the shaft."""
     disturbance: Disturbance = Disturbance()
+    """Unknown constants of (33)."""
     load: Annotated[list[Load], Field(max_length=MAX_LOADS)] = []
+    """Load torques on the shaft; they add up."""
     fault: list[Fault] = []
+    """What goes wrong, and when."""
     black_box: bool = False
+    """Keep what the drive did for hil faults to judge."""
 
     @property
     def all_loads(self) -> list[Any]:

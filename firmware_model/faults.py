@@ -26,7 +26,9 @@ class FaultTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     at_s: Since
+    """When it begins [plant time]."""
     for_s: Span | None = None
+    """How long it lasts; left out: for good."""
 
     def active(self, t_ns: int) -> bool:
         """True while the fault is there; both ends are exact nanoseconds."""
@@ -38,8 +40,11 @@ class FrameFault(FaultTable):
     """Something happens to a share of the frames of one message, in the direction in which it travels."""
 
     message: str = "FEEDBACK"
+    """Name of the message in the DBC."""
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Share of its frames that are hit."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
+    """Seed of the draw which ones."""
 
 
 class Drop(FrameFault):
@@ -53,6 +58,7 @@ class Delay(FrameFault):
 
     kind: Literal["delay"]
     delay_ms: Annotated[float, Field(ge=1e-6, le=1e6, allow_inf_nan=False)]
+    """By how much later."""
 
 
 class Duplicate(FrameFault):
@@ -72,6 +78,7 @@ class Corrupt(FrameFault):
 
     kind: Literal["corrupt"]
     bits: Annotated[int, Field(ge=1, le=32)] = 1
+    """How many bits are flipped."""
 
 
 class FrozenCounter(FrameFault):
@@ -97,7 +104,9 @@ class Noise(FaultTable):
 
     kind: Literal["noise"]
     w_noise_rad_s: NonNegative = 0.0
+    """Noise of the measured speed, standard deviation."""
     i_noise_a: NonNegative = 0.0
+    """Noise of the measured currents, standard deviation."""
 
 
 class Bias(FaultTable):
@@ -105,8 +114,11 @@ class Bias(FaultTable):
 
     kind: Literal["bias"]
     w_rad_s: Finite = 0.0
+    """Added to the measured speed."""
     i_q_a: Finite = 0.0
+    """Added to the measured i_q."""
     i_d_a: Finite = 0.0
+    """Added to the measured i_d."""
 
 
 class EncoderSlip(FaultTable):
@@ -114,6 +126,7 @@ class EncoderSlip(FaultTable):
 
     kind: Literal["encoder-slip"]
     angle_deg: Finite
+    """Electrical angle by which the rotor angle is off."""
 
 
 class PhaseLoss(FaultTable):
@@ -127,6 +140,7 @@ class DcLink(FaultTable):
 
     kind: Literal["dc-link"]
     v_dc_v: Positive
+    """Where the DC link stands."""
 
 
 class OverTemperature(FaultTable):
@@ -134,6 +148,7 @@ class OverTemperature(FaultTable):
 
     kind: Literal["over-temperature"]
     rate_k_s: Positive
+    """Rise a second."""
 
 
 class ExtraLoad(FaultTable):
@@ -141,6 +156,7 @@ class ExtraLoad(FaultTable):
 
     kind: Literal["load"]
     torque_n_m: Finite
+    """Torque, positive against positive speed."""
 
 
 class BrownOut(FaultTable):
@@ -148,6 +164,7 @@ class BrownOut(FaultTable):
 
     kind: Literal["brown-out"]
     for_s: Span
+    """How long the supply is away."""
 
 
 LinkFault = Drop | Delay | Duplicate | Reorder | Corrupt | FrozenCounter | BusOff

@@ -16,6 +16,7 @@ from hil.commands import (
     begin,
     bench,
     campaign,
+    config,
     convert,
     demo,
     emulated,
@@ -54,6 +55,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil campaign PLAN            thousands of cases over all cores: yield, what matters, worst
   hil compare CONFIG           laws tuned by one optimiser to the same limits, side by side
   hil design CONFIG            windows and poles for a motor, its noise and a wish
+  hil config explain KEY       what a config key means: unit, range, default
   hil completion bash          completion for the shell; also zsh, tcsh
   hil paper                    everything the paper prints and draws, recomputed
 """
@@ -74,6 +76,7 @@ MODULES = (
     faults,
     campaign,
     tuning,
+    config,
 )
 
 

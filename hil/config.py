@@ -100,25 +100,40 @@ class MotorTable(Table):
     """Parameters of a PMSM: what the controller believes. Amplitude-invariant dq, mechanical speed."""
 
     name: str = ""
+    """What the motor is called, for reports."""
     R_s_ohm: Positive
+    """Resistance R_s of a phase."""
     L_d_h: Positive
+    """Inductance L_d of the d axis."""
     L_q_h: Positive
+    """Inductance L_q of the q axis."""
     psi_f_wb: Positive
+    """Flux linkage psi_f of the magnets: peak phase voltage over electrical speed."""
     n_p: Annotated[int, Field(ge=1, le=100)]
+    """Pole pairs n_p."""
     J_kg_m2: Positive
+    """Moment of inertia J of motor and load together."""
     B_f_n_m_s: NonNegative = 0.0
+    """Viscous friction B_f: torque over mechanical speed."""
 
 
 class LoopTable(Table):
     """Rate, pacing and clock of the loop."""
 
     rate_hz: Annotated[int, Field(ge=10, le=20_000)] = 1000
+    """Ticks a second, 1 / T_s; divides 1e9, so that a period is a whole number of nanoseconds."""
     pacing: Literal["sync", "feedback", "timer"] = "sync"
+    """What begins a tick: our SYNC, the drive's cyclic frame (feedback), or the loop's own clock (timer)."""
     clock: Literal["realtime", "lockstep"] = "realtime"
+    """Real time, or lockstep with the emulator: as fast as it goes, the same bits each time."""
     duration_s: Seconds | None = None
+    """The run stops after this time; left out: it goes on until it is stopped."""
     feedback_timeout_us: Annotated[int, Field(ge=10, le=100_000)] | None = None
+    """How long after its deadline a tick waits for feedback; left out: 0.6 of the period."""
     max_gap_ticks: Annotated[int, Field(ge=1, le=64)] = 20
+    """The run ends (LOOP_OVERRUN) when the loop is late by more periods than this."""
     shadow: bool = False
+    """Listen and compute beside another controller, and send nothing."""
 
     @field_validator("rate_hz")
     @classmethod
@@ -152,15 +167,21 @@ class RealtimeTable(Table):
     """What is asked of the operating system; what it does not grant is said, not assumed."""
 
     fifo_priority: Annotated[int, Field(ge=0, le=98)] = 50
+    """Priority of the loop under SCHED_FIFO; 0: the system's usual scheduling."""
     cpu: Annotated[int, Field(ge=0, le=4095)] | None = None
+    """Number of the processor that the loop stays on; left out: any."""
     lock_memory: bool = True
+    """Keep all memory of the loop's process in RAM (mlockall)."""
 
 
 class GuardianTable(Table):
     """The process that stops the drive when the loop falls silent for longer than any tolerated skip."""
 
     enabled: bool = True
+    """Start the guardian beside the loop."""
     timeout_ms: Annotated[float, Field(ge=1, le=MOST_GUARDIAN_MS, allow_inf_nan=False)] | None = None
+    """Silence of the loop after which it stops the drive; left out: five periods above loop.max_gap_ticks, at
+    least 10 ms."""
 
     def timeout_ns(self, loop: LoopTable) -> int:
         """Default: five periods more than the gap at which the supervisor stops, at least 10 ms."""
@@ -173,39 +194,47 @@ class BusTable(Table):
     """The CAN bus, in python-can's terms."""
 
     interface: str = "hil-local"
+    """Interface of python-can: hil-local (this machine alone), socketcan, kvaser, pcan and others."""
     channel: str = "demo"
+    """Channel of that interface: any name for hil-local, vcan0 or can0 for socketcan."""
     bitrate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    """Bits a second of the arbitration phase, for interfaces that set it, and for the bus load."""
     data_bitrate: Annotated[int, Field(ge=10_000, le=8_000_000)] | None = None
+    """Bits a second of the data phase of CAN FD; left out: as bitrate."""
     fd: bool = False
+    """CAN FD."""
 
 
 class DriveTable(Table):
     """The drive: its DBC and node."""
 
     dbc: str
+    """Path of the drive's DBC file, relative to this file."""
     node_id: Annotated[int, Field(ge=0, le=255)] = 1
+    """Number of the drive on the bus; it moves the identifiers of the DBC as node_rule says."""
     node_rule: str = ""
     """Where the node's number goes in identifiers, as "id << 5"; empty: CANopen's."""
     heartbeat_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] = 3.0
+    """How long to listen for the drive before arming, and in hil check."""
     signals: dict[str, Any] | None = None
+    """Which signal of the DBC plays which part; left out: the house protocol (docs/protocol.md)."""
     """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""
 
 
 def _annotation(key: Key) -> tuple[Any, Any]:
     """Type and default of a member's key, as pydantic takes them."""
     if key.type == "flag":
-        return bool, key.default
+        return bool, Field(key.default, description=key.doc)
     most = MOST if key.most is None else key.most
     least = LEAST if key.least is None and key.above == 0.0 else key.least
     bounds: Any = Field(gt=key.above, ge=least, le=most, allow_inf_nan=False)
     kind: Any = Annotated[float, bounds]
     if key.type == "numbers":
         kind = Annotated[list[kind], Field(min_length=1, max_length=key.count)]
-    return (
-        (kind, ...)
-        if key.default is REQUIRED
-        else (kind | None if key.default is None else kind, key.default)
-    )
+    given = ... if key.default is REQUIRED else key.default
+    more: Any = {"x-unit": key.unit} if key.unit else None
+    about = Field(given, description=key.doc, json_schema_extra=more)
+    return kind | None if given is None else kind, about
 
 
 def _tables(members: Mapping[str, Any], suffix: str, common: dict[str, Any]) -> Any:
@@ -238,13 +267,16 @@ def _law_kind(value: Any) -> Any:
     return value.get("kind", "cascade") if isinstance(value, Mapping) else getattr(value, "kind", None)
 
 
+COUPLING = "Reluctance torque and cross-coupling are known terms; false: the observers find them."
 if typing.TYPE_CHECKING:
     ChannelTable = Any
     ControllerTable = Any
 else:
     ChannelTable = _tables(observers(), "Observer", {})
     """One channel's observer: a table of each registered kind (:mod:`hil.control.observers`)."""
-    ControllerTable = _tables(laws(), "Controller", {"compensate_coupling": (bool, True)})
+    ControllerTable = _tables(
+        laws(), "Controller", {"compensate_coupling": (bool, Field(True, description=COUPLING))}
+    )
     """The control law: a table of each registered kind (:mod:`hil.control.laws`)."""
 
 
@@ -252,33 +284,59 @@ class ObserverTable(Table):
     """The disturbance observer of the speed channel and of both current channels."""
 
     speed: ChannelTable
+    """Observer of the load torque, in the speed channel."""
     current: ChannelTable
+    """Observer of the voltage errors, in both current channels."""
 
 
 class LimitsTable(Table):
     """What must never be exceeded. There are no defaults for the first five: a user decides them."""
 
     w_max_rad_s: Positive
+    """Largest speed |w|; above it for trip_ticks the run ends (OVER_SPEED)."""
     i_max_a: Positive
+    """Largest current that the law asks for."""
     i_trip_a: Positive
+    """Current (i_q^2 + i_d^2)^1/2 above which the run ends (OVER_CURRENT); above i_max_a."""
     u_max_v: Positive
+    """Radius of the voltage circle that no command leaves; at most V_dc / sqrt(3) can be had."""
     du_max_v: Positive
+    """Largest change of u_q and of u_d from one tick to the next."""
     T_L_max_n_m: NonNegative = 0.0
+    """Largest torque that may be commanded to a load machine (kind fac); 0: none."""
     v_dc_min_v: NonNegative = 0.0
+    """DC link below which the run ends (DC_LINK_UNDER_VOLTAGE)."""
     v_dc_max_v: Positive = 1e4
+    """DC link above which the run ends (DC_LINK_OVER_VOLTAGE)."""
     temperature_max_c: Annotated[float, Field(ge=-273.15, le=1e4, allow_inf_nan=False)] = 120.0
+    """Temperature of motor or inverter above which the run ends (OVER_TEMPERATURE)."""
     i_continuous_a: Positive | None = None
+    """Current that the motor bears for ever; i2t counts from it. Left out: i_max_a."""
     i2t_max_a2s: Positive | None = None
+    """Largest sum of i^2 - i_continuous^2 over time (I2T); left out: no such limit."""
     power_window_s: Annotated[float, Field(ge=1e-3, le=1e5, allow_inf_nan=False)] = 1.0
+    """Time constant with which the sum of energy_max_j forgets."""
     energy_max_j: Positive | None = None
+    """Largest electrical energy in or out within power_window_s (ENERGY); left out: no such limit."""
     applied_deviation_max_v: Positive | None = None
+    """Largest distance of the voltage that the drive applies from the one sent, for guard_trip_ticks; left
+    out: no such limit."""
     following_error_rad_s: Positive | None = None
+    """Largest |w* - w| for following_error_s (FOLLOWING_ERROR); left out: no such limit."""
     following_error_s: Annotated[float, Field(ge=1e-6, le=3600, allow_inf_nan=False)] = 0.1
+    """How long the following error may be too large."""
     i_d_max_a: Positive | None = None
+    """|i_d|, which is held at zero, may be above this in few ticks only (CURRENT_UNCONTROLLED); left out: no
+    such limit."""
     open_phase_min_a: Positive | None = None
+    """|i_d| above this and above |i_q| / 3 in most ticks is an open phase (CURRENT_UNCONTROLLED); left out:
+    not looked for."""
     trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
+    """Periods in a row for which a measured limit must be exceeded for the run to end."""
     guard_trip_ticks: Annotated[int, Field(ge=1, le=10**9)] = 200
+    """Periods for which the guard may change the command before the run ends (GUARD_PERSISTENT)."""
     soft_start_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)] = 0.0
+    """Time in which the voltage circle grows from 0 to u_max_v after enabling."""
 
     @model_validator(mode="after")
     def _ordered(self) -> LimitsTable:
@@ -293,11 +351,19 @@ class FeedbackTable(Table):
     """What to do when feedback is missing or damaged: hold, then quick stop, then fault."""
 
     hold_ticks: Annotated[int, Field(ge=0, le=1000)] = 3
+    """Periods without fresh feedback, or with an old echo, that are ridden out (STALE_FEEDBACK,
+    COMMAND_LOST)."""
     quick_stop_ticks: Annotated[int, Field(ge=1, le=10_000)] = 20
+    """Periods of a quick stop without feedback after which it ends as a fault."""
     error_budget: Annotated[int, Field(ge=1, le=10_000)] = 8
+    """Damaged, repeated or lost frames that are ridden out; each good tick forgives a quarter of one."""
     frozen_ticks: Annotated[int, Field(ge=1, le=10_000)] = 5
+    """Periods of equal readings although the voltage moved after which the run ends (FROZEN_FEEDBACK)."""
     repeat_ticks: Annotated[int, Field(ge=2, le=10_000)] | None = None
+    """The same for a turning motor at constant voltage, where the sensors are known to be noisy; left out:
+    not looked for."""
     enable_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] = 2.0
+    """Time in which the drive must reach operation once it is asked to (ENABLE_TIMEOUT)."""
     status_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] | None = None
     """Age that a slow message of the drive may reach; by default from its cycle time in the DBC."""
 
@@ -307,8 +373,11 @@ class StepReference(Table):
 
     kind: Literal["step"]
     w_rad_s: Speed
+    """Speed w* after the step."""
     at_s: Since = 0.0
+    """When it steps."""
     i_q_a: Finite = 0.0
+    """Current i_q*, for the paper's own law (controller.kind fac) alone."""
 
 
 class RampReference(Table):
@@ -316,10 +385,15 @@ class RampReference(Table):
 
     kind: Literal["ramp"]
     w_rad_s: Speed
+    """Speed w* after the ramp."""
     rate_rad_s2: Positive
+    """Slope of the ramp."""
     at_s: Since = 0.0
+    """When it begins."""
     down_at_s: Since | None = None
+    """When the ramp back to 0 begins; left out: never."""
     i_q_a: Finite = 0.0
+    """Current i_q*, for the paper's own law (controller.kind fac) alone."""
 
 
 class SCurveReference(Table):
@@ -327,11 +401,17 @@ class SCurveReference(Table):
 
     kind: Literal["s-curve"]
     w_rad_s: Speed
+    """Speed w* after the ramp."""
     rate_rad_s2: Positive
+    """Largest slope."""
     jerk_rad_s3: Positive
+    """Slope of the slope."""
     at_s: Since = 0.0
+    """When it begins."""
     down_at_s: Since | None = None
+    """When the way back to 0 begins; left out: never."""
     i_q_a: Finite = 0.0
+    """Current i_q*, for the paper's own law (controller.kind fac) alone."""
 
 
 class SineReference(Table):
@@ -339,9 +419,13 @@ class SineReference(Table):
 
     kind: Literal["sine"]
     offset_rad_s: Speed = 0.0
+    """Mean of w*."""
     amplitude_rad_s: Speed
+    """Amplitude of w*."""
     frequency_hz: Positive
+    """Frequency f."""
     i_q_a: Finite = 0.0
+    """Current i_q*, for the paper's own law (controller.kind fac) alone."""
 
 
 class TableReference(Table):
@@ -349,8 +433,11 @@ class TableReference(Table):
 
     kind: Literal["table"]
     t_s: Annotated[list[Since], Field(min_length=2, max_length=256)]
+    """Times of the points, increasing."""
     w_rad_s: Annotated[list[Speed], Field(min_length=2, max_length=256)]
+    """Speed w* at those times; constant before the first and after the last."""
     i_q_a: Finite = 0.0
+    """Current i_q*, for the paper's own law (controller.kind fac) alone."""
 
     @model_validator(mode="after")
     def _matching(self) -> TableReference:
@@ -376,56 +463,88 @@ class StopTable(Table):
     """
 
     ramp_rad_s2: NonNegative | None = None
+    """Slope of the ramp to rest; 0: stop at once. Left out: w_max_rad_s in a second, at most half of what the
+    motor's torque gives."""
     ramp_max_s: Annotated[float, Field(gt=0, le=60)] = 5.0
+    """The drive is stopped after this time, at rest or not."""
 
 
 class SetpointTable(Table):
-    """What ``hil set`` may ask of a running run; None: 0.9 of the limit, at the rate of the stop's ramp."""
+    """What ``hil set`` may ask of a running run; left out: 0.9 of the limit, by the stop's ramp."""
 
     enabled: bool = True
+    """Take set-points of hil set at all."""
     w_min_rad_s: Finite | None = None
+    """Least speed that may be asked for; left out: -0.9 of limits.w_max_rad_s."""
     w_max_rad_s: Finite | None = None
+    """Largest speed that may be asked for; left out: 0.9 of limits.w_max_rad_s."""
     rate_rad_s2: Positive | None = None
+    """Slope on the way to a new speed; left out: that of stop.ramp_rad_s2."""
     i_q_max_a: Positive | None = None
+    """Largest |i_q| that may be asked for (kind fac); left out: 0.9 of limits.i_max_a."""
     i_q_rate_a_s: Positive | None = None
+    """Slope on the way to a new i_q; left out: limits.i_max_a in a second."""
 
 
 class LogTable(Table):
     """Where the log goes."""
 
     folder: str = "../logs"
+    """Folder of the logs, relative to this file."""
     name: str | None = None
+    """Name of the log file; left out: this file's name and the time (UTC)."""
     frames: bool = True
+    """Log every CAN frame beside the ticks."""
     compression: Literal["zstd", "lz4"] = "zstd"
+    """Compression of the chunks."""
     split_s: Annotated[float, Field(ge=1, le=1e7, allow_inf_nan=False)] | None = None
+    """Begin a new file after this time; left out: one file."""
     split_mb: Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)] | None = None
+    """Begin a new file after this size; left out: one file."""
 
 
 class CriteriaTable(Table):
     """What a run must reach, judged by ``hil report``; every one is the largest value that passes."""
 
     tracking_rms_max_rad_s: NonNegative | None = None
+    """Tracking error w* - w, rms."""
     dip_max_rad_s: NonNegative | None = None
+    """Worst dip of the speed after a load step."""
     recovery_max_s: NonNegative | None = None
+    """Slowest recovery to 0.5 rad/s after a load step."""
     rise_max_s: NonNegative | None = None
+    """Slowest rise from 10 to 90 %."""
     overshoot_max_percent: NonNegative | None = None
+    """Largest overshoot."""
     settling_max_s: NonNegative | None = None
+    """Slowest settling to 2 %."""
     estimate_error_max_n_m: NonNegative | None = None
+    """Load estimate off the true load, N ticks after a step."""
     ripple_max_rad_s: NonNegative | None = None
+    """Speed ripple at rest, rms."""
     iae_max_rad: NonNegative | None = None
+    """Integral of |w - w*|."""
     skipped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    """Periods that the loop skipped."""
     dropped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    """Records that the log dropped."""
     lost_feedback_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    """Ticks in operation without fresh feedback."""
     crc_errors_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
+    """Ticks with a CRC error."""
     lateness_p999_max_us: NonNegative | None = None
+    """Lateness of the ticks, 99.9th percentile."""
     lateness_max_us: NonNegative | None = None
+    """Lateness of the latest tick."""
     bus_load_max_percent: NonNegative | None = None
+    """Bus load in the busiest second."""
 
 
 class EmulatorTable(Table):
     """The emulated drive that belongs to this run; its parameters are in its own file."""
 
     plant: str
+    """Path of the emulated drive's file, relative to this file."""
 
 
 def _cascade() -> Any:
@@ -438,6 +557,7 @@ class FaultsTable(Table):
     """What `hil faults` expects of this configuration: by row, in place of what the shipped matrix does."""
 
     expect: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """What must come of a row, by its name (keys: faults:row.expect)."""
 
 
 class RunConfig(Table):
@@ -450,10 +570,12 @@ class RunConfig(Table):
     drive: DriveTable
     motor: Annotated[MotorTable, BeforeValidator(included)]
     controller: ControllerTable = Field(default_factory=_cascade)
+    """The control law; kind cascade may be left out."""
     observer: ObserverTable
     limits: LimitsTable
     feedback: FeedbackTable = FeedbackTable()
     reference: ReferenceTable
+    """The speed reference w*."""
     stop: StopTable = StopTable()
     setpoint: SetpointTable = SetpointTable()
     log: LogTable = LogTable()
@@ -567,17 +689,18 @@ def _keys_at(model: type[BaseModel], loc: tuple[Any, ...]) -> list[str]:
             m
             for owner in models
             if part in owner.model_fields
-            for m in _models_in(owner.model_fields[part].annotation)
+            for m in models_in(owner.model_fields[part].annotation)
         ]
         models = found or [m for m in models if part in _tags(m)] or models
     return [key for m in models for key in m.model_fields]
 
 
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """The tables that a field's type may be."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     if isinstance(annotation, types.UnionType) or typing.get_origin(annotation) is not None:
-        return [m for a in typing.get_args(annotation) for m in _models_in(a)]
+        return [m for a in typing.get_args(annotation) for m in models_in(a)]
     return []
 
 

@@ -41,28 +41,46 @@ class CovarianceTable(Table):
     """Keys that vary together, normal with a covariance; ``mean`` left out: the config's own values."""
 
     keys: Annotated[list[str], Field(min_length=1)]
+    """The keys that vary together."""
     covariance: list[list[float]]
+    """Their covariance: symmetric, in the keys' units."""
     mean: list[float] | None = None
+    """Their means; left out: the values of the configuration."""
 
 
 class PlanTable(Table):
     """A plan as it stands in its file."""
 
     config: str
+    """Path of the run's configuration, relative to this file."""
     name: str = ""
+    """Name of the campaign, for its report."""
     samples: int | None = None
+    """How many samples to draw; needed by [random], [lhs], [sobol] and [[covariance]]."""
     seed: Annotated[int, Field(ge=0, lt=2**63)] = 1
+    """Seed of all draws."""
     settings: Annotated[list[str], Field(alias="set", default_factory=list)]
+    """Keys of the run's configuration for all cases, as --set."""
     plant_set: Annotated[list[str], Field(default_factory=list)]
+    """Keys of the plant for all cases, as --plant-set."""
     grid: Annotated[Axes, Field(default_factory=dict)]
+    """Every combination of these lists of values, by key."""
     rows: Annotated[Axes, Field(alias="list", default_factory=dict)]
+    """Lists of one length, gone through side by side, by key."""
     corners: Annotated[Axes, Field(default_factory=dict)]
+    """Every combination of low and high, by key."""
     random: Annotated[Axes, Field(default_factory=dict)]
+    """Distributions that are drawn independently, by key."""
     lhs: Annotated[Axes, Field(default_factory=dict)]
+    """Distributions that are drawn as a Latin hypercube, by key."""
     sobol: Annotated[Axes, Field(default_factory=dict)]
+    """Distributions that are drawn along Sobol's sequence, by key."""
     covariance: Any = None
+    """Keys that vary together: keys, covariance, mean."""
     variants: Annotated[dict[str, Axes], Field(default_factory=dict)]
+    """Bundles of settings to compare, by name."""
     criteria: Annotated[Axes, Field(default_factory=dict)]
+    """Criteria in place of those of the configuration."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
 import tomllib
 from pathlib import Path
 
 from hil.commands.common import Commands, print_json, say
 
+SCHEMA = re.compile(r"#:schema \S*?([\w.]+\.schema\.json)")
 KINDS = ("demo", "vcan0", "can0", "inverter", "paper")
 
 
@@ -53,21 +55,38 @@ def cmd_init(args: argparse.Namespace) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise HilError(f"{folder}: is not an empty folder; name a new one")
     source = find_shipped(f"{args.like}.toml")
+    made: dict[Path, str] = {}
     files = {(folder / path.resolve().relative_to(source.resolve().parent)): path for path in wanted(source)}
     try:
         for to, path in files.items():
             to.parent.mkdir(parents=True, exist_ok=True)
-            text = path.read_text(encoding="utf-8")
-            to.write_text(text.replace('folder = "../logs"', 'folder = "logs"'), encoding="utf-8")
+            text = path.read_text(encoding="utf-8").replace('folder = "../logs"', 'folder = "logs"')
+            if path.suffix == ".toml":
+                text = _with_schema(text, to, folder, made)
+            to.write_text(text, encoding="utf-8")
+        for to, text in made.items():
+            to.write_text(text, encoding="utf-8")
     except OSError as error:
         raise HilError(f"{folder}: can't be written ({error.strerror}); name another folder") from error
     config = folder / f"{args.like}.toml"
     if args.json:
-        print_json({"config": str(config), "files": sorted(str(to) for to in files)})
+        print_json({"config": str(config), "files": sorted(map(str, [*files, *made]))})
     else:
-        say("\n".join(f"hil: {to}" for to in sorted(files)))
+        say("\n".join(f"hil: {to}" for to in sorted([*files, *made])))
         say(f"hil: next: hil demo {config}, or hil emulate {config} and hil run {config}")
     return 0
+
+
+def _with_schema(text: str, to: Path, folder: Path, made: dict[Path, str]) -> str:
+    """A file's text whose ``#:schema`` names the schema in ``folder``, which is noted in ``made``."""
+    from hil.manual.page import schema_text
+
+    if not (named := SCHEMA.match(text)):
+        return text
+    schema = folder / named[1]
+    made[schema] = schema_text(named[1])
+    up = "../" * len(to.parent.relative_to(folder).parts)
+    return f"#:schema {up}{named[1]}" + text[named.end() :]
 
 
 def cmd_completion(args: argparse.Namespace) -> int:

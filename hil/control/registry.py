@@ -40,6 +40,8 @@ class Key:
     most: float | None = None
     count: int = 3
     """Most entries of ``numbers``."""
+    unit: str = ""
+    """Unit, where the name does not end in it."""
 
 
 def complete(given: Values, member: Observer | Law) -> dict[str, Any]:

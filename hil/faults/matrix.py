@@ -25,7 +25,9 @@ class Stall(Table):
 
     kind: Literal["stall"]
     at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    """When [s from the start of the run]."""
     for_ms: Annotated[int, Field(ge=1, le=5000)]
+    """How long the process stands still."""
 
 
 class WriterKilled(Table):
@@ -33,6 +35,7 @@ class WriterKilled(Table):
 
     kind: Literal["writer-killed"]
     at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    """When [s from the start of the run]."""
 
 
 class DiskFull(Table):
@@ -40,6 +43,7 @@ class DiskFull(Table):
 
     kind: Literal["disk-full"]
     at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    """When [s from the start of the run]."""
 
 
 class ClockStep(Table):
@@ -47,7 +51,9 @@ class ClockStep(Table):
 
     kind: Literal["clock-step"]
     at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    """When [s from the start of the run]."""
     step_s: Finite
+    """By how much the wall clock jumps."""
 
 
 class InterfaceDown(Table):
@@ -55,7 +61,9 @@ class InterfaceDown(Table):
 
     kind: Literal["interface-down"]
     at_s: Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
+    """When [s from the start of the run]."""
     for_ms: Annotated[int, Field(ge=1, le=5000)] | None = None
+    """For how long; left out: for good."""
 
 
 Host = Annotated[Stall | WriterKilled | DiskFull | ClockStep | InterfaceDown, Field(discriminator="kind")]
@@ -69,12 +77,19 @@ class Expect(Table):
     """
 
     reaction: Literal["ride through", "stop"]
+    """The run rides through, or stops."""
     reason: list[str] = Field(default_factory=list)
+    """Names of the reasons any of which may end the run (docs/stop-reasons.md)."""
     within_ms: Positive | None = None
+    """Longest time from the fault to the safe state."""
     w_error_rad_s: Positive = 1.0
+    """Largest |w* - w| at the end of a run that rides through."""
     w_max_rad_s: Positive | None = None
+    """Largest true speed from the fault on; left out: not judged."""
     i_max_a: Positive | None = None
+    """Largest true current from the fault on; left out: not judged."""
     log: Literal["complete", "readable"] = "complete"
+    """The log is whole, or can at least be read."""
 
     @field_validator("reason")
     @classmethod
@@ -106,11 +121,17 @@ class Row(Table):
     """One run with its faults; ``set`` and ``plant_set`` override keys of its configurations."""
 
     name: Annotated[str, Field(min_length=1, max_length=60)]
+    """Name of the row, one of its own."""
     fault: list[dict[str, Any]] = Field(default_factory=list)
+    """Faults of the drive and its bus, as in a plant's file (keys: plant:fault)."""
     host: Host | None = None
+    """Fault of the host; left out: none."""
     set: list[str] = Field(default_factory=list)
+    """Keys of the run's configuration for this row, as --set."""
     plant_set: list[str] = Field(default_factory=list)
+    """Keys of the plant for this row, as --plant-set."""
     expect: Expect
+    """What must come of it."""
 
     @property
     def realtime(self) -> bool:
@@ -131,11 +152,17 @@ class Matrix(Table):
     """All rows, and what they have in common."""
 
     run: str = "demo.toml"
+    """Path of the run's configuration, relative to this file."""
     set: list[str] = Field(default_factory=list)
+    """Keys of the run's configuration for all rows, as --set."""
     host_set: list[str] = Field(default_factory=list)
+    """The same for rows with a fault of the host alone."""
     host_plant_set: list[str] = Field(default_factory=list)
+    """Keys of the plant for rows with a fault of the host."""
     plant_set: list[str] = Field(default_factory=list)
+    """Keys of the plant for all rows, as --plant-set."""
     row: Annotated[list[Row], Field(min_length=1)]
+    """The runs."""
 
     @model_validator(mode="after")
     def _names_differ(self) -> Matrix:

@@ -14,6 +14,7 @@ STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclass
 STDLIB_OK |= {"cmath", "functools", "importlib"}
 ROOT_MODULES = ("app", "fused", "cli", "emulate", "simulate", "demo", "check", "faults/case")
 ROOT_MODULES += ("convert/rerun", "campaign/case", "replay/frames", "replay/sent")
+ROOT_MODULES += ("manual/schema",)
 JIT = "drivers.jit"
 """The one jit module of all: knows neither controller nor drive, so that control may re-export it."""
 COMPOSITION = {f"hil/{name}.py" for name in ROOT_MODULES}

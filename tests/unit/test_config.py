@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from firmware_model.config import PlantConfig
-from hil.config import MAX_CONFIG_BYTES, RunConfig, _models_in, _tags, load_toml
+from hil.config import MAX_CONFIG_BYTES, RunConfig, _tags, load_toml, models_in
 from hil.errors import ConfigError
 from tests.conftest import ROOT
 
@@ -104,8 +104,8 @@ def numbers(model: type[BaseModel], given: dict[str, Any], path: str = "") -> It
     for name, field in model.model_fields.items():
         if isinstance(given.get(name), list):
             continue
-        inner = [m for m in _models_in(field.annotation) if "kind" not in m.model_fields]
-        inner += [m for m in _models_in(field.annotation) if (given.get(name) or {}).get("kind") in _tags(m)]
+        inner = [m for m in models_in(field.annotation) if "kind" not in m.model_fields]
+        inner += [m for m in models_in(field.annotation) if (given.get(name) or {}).get("kind") in _tags(m)]
         for one in inner[:1]:
             yield from numbers(one, given.get(name) or {}, f"{path}{name}.")
         if not inner and any(kind in repr(field.annotation) for kind in ("int", "float")):

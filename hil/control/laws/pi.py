@@ -30,9 +30,9 @@ MEMBER = Law(
     CODE,
     design,
     {
-        "speed_gain_as_rad": Key("proportional gain of the speed [A s/rad]"),
-        "speed_integral_a_rad": Key("integral gain of the speed [A/rad]", above=None, least=0.0),
-        "current_gain_v_a": Key("proportional gain of the currents [V/A]"),
-        "current_integral_v_as": Key("integral gain of the currents [V/(A s)]", above=None, least=0.0),
+        "speed_gain_as_rad": Key("proportional gain of the speed"),
+        "speed_integral_a_rad": Key("integral gain of the speed", above=None, least=0.0),
+        "current_gain_v_a": Key("proportional gain of the currents"),
+        "current_integral_v_as": Key("integral gain of the currents", above=None, least=0.0),
     },
 )
