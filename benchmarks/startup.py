@@ -57,6 +57,7 @@ def armed(one: Stand) -> Took:
 def measure(turns: int) -> dict[str, Took]:
     """The fastest of each, taken by turns so that all see the same machine."""
     best: dict[str, Took] = {}
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # what is installed has its byte code beside it
     with stand(find_config("demo.toml"), Overrides()) as one:
         jobs: dict[str, Callable[[], Took]] = {
             name: lambda words=words: once(*words)  # type: ignore[misc]

@@ -16,9 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from numba.core import caching
+from numba.core import caching, runtime
 
 numba_caching: Any = caching  # ships no types
+numba_runtime: Any = runtime
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ("hil", "drivers", "firmware_model")
 _IMPORT: Final = re.compile(
@@ -61,6 +62,7 @@ def _modules(module: str, names: str) -> list[str]:
     return [module, *(f"{module}.{name}" for name in re.findall(r"\w+", re.sub(r"#.*", "", names)))]
 
 
+@functools.cache
 def _file(module: str) -> Path | None:
     path = ROOT.joinpath(*module.split("."))
     candidates = (path.with_suffix(".py"), path / "__init__.py")
@@ -106,12 +108,18 @@ class KernelLocator(numba_caching._CacheLocator):  # type: ignore[misc] # numba 
     @classmethod
     def from_function(cls, _function: Callable[..., Any], py_file: str) -> KernelLocator | None:
         """The locator of a kernel; None where the folder can't be made, and numba looks for another."""
-        locator = cls(py_file)
-        try:
-            locator.ensure_cache_path()
-        except OSError:
-            return None
-        return locator
+        return _locator(py_file)
+
+
+@functools.cache
+def _locator(py_file: str) -> KernelLocator | None:
+    """The one locator of a file's kernels: a file has many, and to try its folder takes long."""
+    locator = KernelLocator(py_file)
+    try:
+        locator.ensure_cache_path()
+    except OSError:
+        return None
+    return locator
 
 
 class _Kernels(numba_caching.CompileResultCacheImpl):  # type: ignore[misc] # as above
@@ -122,3 +130,12 @@ class KernelCache(numba_caching.FunctionCache):  # type: ignore[misc] # as above
     """numba's cache of one function, with :class:`KernelLocator`."""
 
     _impl_class = _Kernels
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """A kept kernel, or None. numba's own reads in first what types and implements each builtin.
+
+        Only to compile needs that, and the compiler does it itself; what is compiled needs the runtime.
+        """
+        numba_runtime.rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)

@@ -439,12 +439,23 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     check_load(setup)
     request = request or StopRequest()
     config = setup.config
-    compile_kernels(setup)
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
-    with _alone(setup), _guarding(setup) as words:
-        return _recorded(setup, request, path, clock, words)
+    with _alone(setup), _writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
+        compile_kernels(setup)  # while the writer starts
+        with _guarding(setup, recorder) as words:
+            return _recorded(setup, request, recorder, clock, words)
+
+
+@contextlib.contextmanager
+def _writing(recorder: Recorder) -> Iterator[Recorder]:
+    """A log that says of a run that was refused why."""
+    try:
+        yield recorder
+    except (LinkError, DriverError, HilError) as error:
+        recorder.close({"ended": f"refused: {error}"})
+        raise
 
 
 @contextlib.contextmanager
@@ -461,8 +472,13 @@ def _alone(setup: Setup) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _guarding(setup: Setup) -> Iterator[Words | None]:
+def _guarding(setup: Setup, recorder: Recorder) -> Iterator[Words | None]:
     """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own."""
+
+    def client() -> DriveClient:
+        recorder.leave()
+        return _client(setup)
+
     config = setup.config
     loop, alone = config.loop, config.bus.interface == "virtual"
     if alone or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
@@ -470,50 +486,43 @@ def _guarding(setup: Setup) -> Iterator[Words | None]:
     else:
         timeout_ns, asked = config.guardian.timeout_ns(loop), config.realtime
         rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
-        with guardian(timeout_ns, rights, lambda: _client(setup)) as words:
+        with guardian(timeout_ns, rights, client) as words:
             yield words
 
 
 def _recorded(
     setup: Setup,
     request: StopRequest,
-    path: Path,
+    recorder: Recorder,
     clock: RealClock | LockstepClock,
     words: Words | None,
 ) -> RunResult:
-    """Open recorder and drive, arm, run."""
+    """Open the drive and the log, arm, run."""
     config = setup.config
-    recorder = Recorder(path, header_of(setup, "run", clock.name), config.loop.rate_hz)
-    try:
-        watch = CommandWatch(setup.binding) if config.loop.shadow else None
-        with opened_client(setup, recorder, clock, watch) as client:
-            say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
-            _await_drive(setup, client)
-            if not watch:
-                _hear_others(setup, client)
-            recorder.await_open()
-            say(f"{'listening only' if watch else 'arming'}; log {path}")
-            drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
-            if words:
-                drive = GuardedDrive(client, words, clock.now_ns)
-            if watch:
-                recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
-            machine, plan = setup.machine.fresh(), plan_of(config)
-            machine = machine if request.ramps else machine.at_once()
-            alone = watch is not None or clock.name != "monotonic"
-            whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
-            takes = set_by_others(setup)
-            with contextlib.closing(Inbox(machine, takes)) as inbox:
-                parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
-                loop = Loop(*parts, inbox if takes else None)
-                client.discard()
-                result = _run_armed(
-                    setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length
-                )
-    except (LinkError, DriverError, HilError) as error:
-        recorder.close({"ended": f"refused: {error}"})
-        raise
-    return result
+    watch = CommandWatch(setup.binding) if config.loop.shadow else None
+    with opened_client(setup, recorder, clock, watch) as client:
+        recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
+        say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
+        _await_drive(setup, client)
+        if not watch:
+            _hear_others(setup, client)
+        recorder.await_open()
+        say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
+        drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
+        if words:
+            drive = GuardedDrive(client, words, clock.now_ns)
+        if watch:
+            recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
+        machine, plan = setup.machine.fresh(), plan_of(config)
+        machine = machine if request.ramps else machine.at_once()
+        alone = watch is not None or clock.name != "monotonic"
+        whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
+        takes = set_by_others(setup)
+        with contextlib.closing(Inbox(machine, takes)) as inbox:
+            parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
+            loop = Loop(*parts, inbox if takes else None)
+            client.discard()
+            return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length)
 
 
 def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:

@@ -236,8 +236,8 @@ def _serve(
 def guardian(timeout_ns: int, rights: Rights, open_stopper: Callable[[], Stopper]) -> Iterator[Words]:
     """A guardian while the block runs, which must be in the thread that runs the loop.
 
-    Fork it before the recorder: it must not hold the recorder's pipes. ``open_stopper`` runs in the guardian
-    and opens a link of its own. Raises HilError when it can't start.
+    ``open_stopper`` runs in the guardian and opens a link of its own; it lets go of what a fork must not keep
+    open, the recorder's pipes. Raises HilError when it can't start.
     """
     words, parent = Words(), os.getpid()
     words.lifeline.hold()

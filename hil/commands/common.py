@@ -22,11 +22,12 @@ Run = Callable[[argparse.Namespace], int]
 
 @contextlib.contextmanager
 def lean_imports() -> Iterator[None]:
-    """Import python-can without asammdf, which it takes where it is: half a second more until a run is armed.
+    """Import python-can without asammdf and numba without coverage, which they take where they are.
 
-    asammdf, and pandas with it, is for MF4 files; no loop reads one.
+    It is half a second more until a run is armed. asammdf, and pandas with it, is for MF4 files; no loop
+    reads one. coverage hears of compiled lines, where it measures; it is here already then.
     """
-    hidden = [name for name in ("asammdf",) if name not in sys.modules]
+    hidden = [name for name in ("asammdf", "coverage") if name not in sys.modules]
     sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: not to be imported
     try:
         yield

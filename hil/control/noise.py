@@ -11,7 +11,6 @@ is the one with least noise. v_{k-j} is the mean of d over the tick that ended j
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from hil.control.errors import ControlDesignError
 from hil.control.linalg import Array
@@ -54,6 +53,8 @@ def noise_matrix(N: int, diagonal: float, neighbour: float) -> Array:
 
 def least_noise(C: Array, b: Array, diagonal: float, neighbour: float) -> Array:
     """g (N,) with C g = b (C (m, N), b (m,)) and least g' Q g. Raises ControlDesignError."""
+    from scipy.linalg import solveh_banded  # loads as long as numpy
+
     N = C.shape[1]
     banded = np.zeros((2, N))
     banded[1], banded[0, 1:] = diagonal, -neighbour

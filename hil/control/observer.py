@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
@@ -171,6 +170,8 @@ def side_by_side(*windows: Window) -> Window:
     own = {name: np.concatenate([getattr(w, name) for w in windows], axis=-1) for name in every}
     if not any(len(w.form) for w in windows):
         return Window(**own)
+    from scipy.linalg import block_diag  # loads as long as numpy
+
     rows = {"form": (), "third": (3,), "g": (FIR_MAX,)}
     for name, shape in rows.items():
         own[name] = np.concatenate([_part(w, name, (*shape, w.n)) for w in windows], axis=-1)

@@ -88,21 +88,28 @@ def refuse() -> int:
 class Recorder:
     """Implements :class:`hil.ports.Recorder`. ``failed`` is what the loop looks at every tick.
 
-    ``header`` holds ``metadata`` (text to text) and ``attachments`` (name to text). The writer starts while
-    the caller goes on; the file is there once :meth:`await_open` has returned.
+    ``header`` holds ``metadata`` (text to text) and ``attachments`` (name to text); None when it is given to
+    :meth:`begin` later. The writer starts while the caller goes on; the file is there once
+    :meth:`await_open` has returned.
     """
 
-    def __init__(self, path: Path, header: dict[str, Any], rate_hz: int) -> None:
+    def __init__(self, path: Path, header: dict[str, Any] | None, rate_hz: int) -> None:
         self.path = path
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
-        self._attach(new_ticks())  # what is compiled for it is there before the loop
-        self._failed = self._closed = False
+        self._failed = self._closed = self._begun = False
         self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
         self._writer = self._spawn()
-        self._say({"path": str(path), "header": header, "chunk_bytes": CHUNK_BYTES})
+        if header is not None:
+            self.begin(header)
+        self._attach(new_ticks())  # what is compiled for it is there before the loop
+
+    def begin(self, header: dict[str, Any]) -> None:
+        """Let the writer open the file with this header."""
+        self._begun = True
+        self._say({"path": str(self.path), "header": header, "chunk_bytes": CHUNK_BYTES})
 
     def _spawn(self) -> subprocess.Popen[bytes]:
         fds = [ring.fd for ring in (self._ticks, self._frames, self._events)]
@@ -198,11 +205,18 @@ class Recorder:
         """Hand over the result, wait for the writer; True when the file is complete."""
         if self._closed:
             return not self._failed
-        self._say(result)
+        if self._begun:  # else there is no file, and nothing to say of it
+            self._say(result)
         complete = self._end_writer(HUNG_TIMEOUT_S if self._failed else CLOSE_TIMEOUT_S) == 0
         self._failed = self._failed or not complete
         self._release()
         return complete
+
+    def leave(self) -> None:
+        """Let go of the writer in a forked process: only then does the controller's death end its input."""
+        for pipe in (self._writer.stdin, self._writer.stdout):
+            assert pipe is not None  # noqa: S101 - PIPE was asked for
+            pipe.close()
 
     def _end_writer(self, timeout_s: float) -> int:
         """End the writer's input and wait for it; kill it when that takes too long.

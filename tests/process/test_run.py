@@ -256,14 +256,38 @@ def test_a_drive_that_takes_no_sync(configs: Path, settings: Settings, pacing: s
     assert replay(Path(result.log)).verdict == "same"
 
 
-@pytest.mark.parametrize("words", [["run"], ["emulate"]])
-def test_a_loop_does_not_import_what_only_exports_need(tmp_path: Path, words: list[str]) -> None:
-    pytest.importorskip("asammdf")
+LOADED = """
+import sys
+from hil import cli
+code = cli.main(sys.argv[1:])
+import can  # as a run has it, which must not bring the rest
+print(code, *sorted({name.split(".")[0] for name in sys.modules} | set(sys.modules)))
+"""
+NOT_FOR_A_LOOP = (
+    "asammdf", "coverage", "dask", "distributed", "h5py", "IPython", "matplotlib", "mcap.writer", "openpyxl",
+    "pandas", "PIL", "plotly", "polars", "pyarrow", "rerun", "rich", "scipy.io", "scipy.linalg",
+    "scipy.optimize", "scipy.signal", "scipy.special", "scipy.stats", "textual", "websockets",
+)  # fmt: skip
+"""What takes long to load and is for other commands: exports, campaigns, pages, the terminal."""
+
+
+def loaded(*words: str) -> list[str]:
+    """Exit code of a command, then what its process has loaded."""
+    command = [sys.executable, "-c", LOADED, *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout.split()
+
+
+def test_a_run_loads_nothing_that_is_for_other_commands(configs: Path, settings: Settings) -> None:
+    """All that comes before arming: kernels, log, guardian, client; then no drive is there."""
+    own = settings("drive.heartbeat_timeout_s=0.1", "log.split_s=60.0")
+    code, *modules = loaded("run", str(configs / "demo.toml"), *flags(own))
+    assert code == "2" and {"hil.fused", "hil.guardian", "hil.log.recorder"} <= set(modules)
+    assert not set(NOT_FOR_A_LOOP) & set(modules)
+
+
+def test_an_emulated_drive_loads_no_exports_either(tmp_path: Path) -> None:
     (tmp_path / "empty.toml").write_text("")
-    script = (
-        "import sys; from hil import cli; code = cli.main(sys.argv[1:]); import can;"
-        "print(code, 'pandas' in sys.modules, 'asammdf' in sys.modules)"
-    )
-    command = [sys.executable, "-c", script, *words, str(tmp_path / "empty.toml")]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.split() == ["2", "False", "False"]
+    code, *modules = loaded("emulate", str(tmp_path / "empty.toml"))
+    assert code == "2" and "hil.emulate" in modules
+    assert not {"asammdf", "coverage", "matplotlib", "pandas"} & set(modules)

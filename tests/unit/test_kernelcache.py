@@ -23,7 +23,9 @@ from hil.factor import (  # the caller's kernel is made of these, too
 def times(x: float) -> float:
     return FACTOR * x
 """
-CALLER = """from drivers.jit import jit
+CALLER = """import sys
+
+from drivers.jit import jit
 from hil import callee
 
 
@@ -35,7 +37,7 @@ def plus(x: float) -> float:
     return 1.0 + times(x)
 
 
-print(plus(3.0), sum(plus.stats.cache_hits.values()))
+print(plus(3.0), sum(plus.stats.cache_hits.values()), "numba.cpython.mathimpl" in sys.modules)
 """
 
 
@@ -55,7 +57,7 @@ def tree(tmp_path: Path) -> Path:
 
 
 def run(tree: Path, **environment: str) -> str:
-    """What the caller prints: its result, and 1 when its kernel was a kept one."""
+    """What the caller prints: its result, 1 when its kernel was a kept one, and what only compiling loads."""
     inherited = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     done = subprocess.run(
         [sys.executable, "-m", "hil.caller"],
@@ -71,24 +73,24 @@ def run(tree: Path, **environment: str) -> str:
 
 @pytest.mark.compiled
 def test_a_change_compiles_what_depends_on_it_alone(tree: Path) -> None:
-    assert run(tree) == "7.0 0"
-    assert run(tree) == "7.0 1"
+    assert run(tree) == "7.0 0 True"
+    assert run(tree) == "7.0 1 False"
     (tree / "hil" / "other.py").write_text("unrelated = 1\n")
-    assert run(tree) == "7.0 1"
+    assert run(tree) == "7.0 1 False"
     (tree / "hil" / "factor.py").write_text("FACTOR = 5.0\n")
-    assert run(tree) == "16.0 0"
+    assert run(tree) == "16.0 0 True"
     files = sorted(path.name for path in (tree / ".cache" / "numba").rglob("*.nb*"))
     (tree / "hil" / "caller.py").write_text(
         "\n\n" + CALLER
     )  # a kernel on another line takes the old one's files
-    assert run(tree) == "16.0 0"
+    assert run(tree) == "16.0 0 True"
     assert sorted(path.name for path in (tree / ".cache" / "numba").rglob("*.nb*")) == files
 
 
 @pytest.mark.compiled
 def test_an_installed_package_keeps_kernels_in_the_users_folder(tree: Path) -> None:
     (tree / "pyproject.toml").unlink()
-    assert run(tree, XDG_CACHE_HOME=str(tree / "home")) == "7.0 0"
+    assert run(tree, XDG_CACHE_HOME=str(tree / "home")) == "7.0 0 True"
     assert list((tree / "home" / "hil-drive" / "numba").rglob("*.nbi"))
     assert not (tree / ".cache").exists()
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 
 from hil.control.errors import ControlDesignError
 from hil.control.fac import sample
@@ -20,6 +19,8 @@ from hil.control.registry import Key, Law, Plan, Values
 
 def lq_gain(A: Array, B: Array, weights: Array) -> Array:
     """K (1, n) of least sum x' diag(weights) x + u^2; B (n, 1). Raises ControlDesignError."""
+    from scipy.linalg import solve_discrete_are  # loads as long as numpy
+
     try:
         P = solve_discrete_are(A, B, np.diag(weights), np.eye(1))
     except (np.linalg.LinAlgError, ValueError) as error:

@@ -10,7 +10,6 @@ With ``filtered_state`` the law takes x_hat (LQG as in the books), else the meas
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import block_diag, solve_discrete_are
 
 from hil.control.errors import ControlDesignError
 from hil.control.fac import SampledModel
@@ -21,6 +20,8 @@ from hil.control.registry import Key, Observer, Values
 
 def gains(Ad: Array, Ed: Array, walk: Array, noise: Array) -> tuple[Array, Array]:
     """L1, L2 (n, n) of the filter for n states. Raises ControlDesignError."""
+    from scipy.linalg import solve_discrete_are  # loads as long as numpy
+
     n = len(noise)
     F = np.block([[Ad, Ed], [np.zeros((n, n)), np.eye(n)]])
     C, R = np.eye(n, 2 * n), np.diag(noise**2)
@@ -37,6 +38,8 @@ def gains(Ad: Array, Ed: Array, walk: Array, noise: Array) -> tuple[Array, Array
 
 def joint(speed: Values, current: Values, model: SampledModel) -> Window:
     """The filter of (w, i_q) and that of i_d, which nothing couples to them. Raises ControlDesignError."""
+    from scipy.linalg import block_diag
+
     walk = np.array([t["d_walk_per_s"] * model.T_s for t in (speed, current)])
     noise = np.array([t["x_noise"] for t in (speed, current)])
     one = gains(model.Ad[:2, :2], model.Ed[:2, :2], walk, noise)
