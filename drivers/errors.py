@@ -29,3 +29,7 @@ class EncodeError(DriverError, ValueError):
 
 class DecodeError(DriverError, ValueError):
     """A frame that can't be applied whole."""
+
+
+class NodeError(DriverError, RuntimeError):
+    """A CANopen node that is silent, refuses an object, or holds another value than it was given."""

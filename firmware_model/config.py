@@ -251,8 +251,11 @@ class PlantConfig(Table):
     """Path of the DBC that the drive speaks, relative to this file."""
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """Number of the drive on the bus."""
-    protocol: Literal["house", "inverter"] = "house"
-    """The house protocol (docs/protocol.md), or inverter: CAN FD, 29-bit identifiers, no SYNC and no echo."""
+    protocol: Literal["house", "inverter", "cia402"] = "house"
+    """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo; cia402:
+    CANopen, mute until hil configure has mapped its PDOs."""
+    eds: str = ""
+    """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"
     """The drive answers SYNC, or sends by its own clock (cyclic)."""
     substep_us: Annotated[int, Field(ge=1, le=100_000)] = 500
@@ -285,6 +288,12 @@ class PlantConfig(Table):
         """The plant's loads and those that its faults add."""
         extra = [fault for fault in self.fault if isinstance(fault, ExtraLoad)]
         return [*self.load, *(_as_step(fault) for fault in extra)]
+
+    @model_validator(mode="after")
+    def _has_its_eds(self) -> PlantConfig:
+        if bool(self.eds) != (self.protocol == "cia402"):
+            raise ValueError('eds and protocol = "cia402" belong together')
+        return self
 
     @model_validator(mode="after")
     def _room_for_loads(self) -> PlantConfig:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -37,6 +37,10 @@ LAST_COMMAND, LAST_LOAD, FIRST_ANSWER = range(3)
 
 class HouseFrames:
     """What the drive reads and writes. ``ignored`` counts frames that are not whole, valid and fresh."""
+
+    due: Sequence[Sent] = ()
+    """It answers to nothing but SYNC."""
+    beat_ns = 100_000_000
 
     def __init__(self, database: Database, *, truth: bool) -> None:
         self.command = database.message("COMMAND", "Counter", "Mode", "Controlword", "VoltageQ", "VoltageD")
@@ -72,7 +76,7 @@ class HouseFrames:
                 )
 
     @property
-    def spoken(self) -> dict[int, int]:
+    def spoken(self) -> dict[int, int] | None:
         """Length of each message that it sends or takes, by identifier."""
         load = [self.load_command] if self.load_command else []
         messages = [self.command, *load, *(message for message, _ in self.answers)]

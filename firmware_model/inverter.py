@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from drivers.bus import Frame
@@ -38,6 +38,8 @@ def int24(value: float) -> bytes:
 class InverterFrames:
     """What this inverter reads and writes. ``ignored`` counts frames that it did not take."""
 
+    due: Sequence[Sent] = ()
+    beat_ns = 0
     sync_id: int | None = None
     counter_modulus = 16
 
@@ -48,7 +50,7 @@ class InverterFrames:
         self.ignored: Counter[str] = Counter()
 
     @property
-    def spoken(self) -> dict[int, int]:
+    def spoken(self) -> dict[int, int] | None:
         """Length of each message that it sends or takes, by identifier."""
         return {STATE_ID: 12, SUPPLY_ID: 8, TRUTH_ID: 8, DEMAND_ID: 12}
 

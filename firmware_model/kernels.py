@@ -21,7 +21,8 @@ ARRAYS: Final = {"params": PARAMS, "state": STATE, "sample": SAMPLE}
 class Kernels:
     """``advance(dt_ns)``, ``sync()``, ``command(counter, controlword, u_q, u_d)`` and ``load(T_L)``.
 
-    They work on the records that were given, in place; ``state`` and ``sample`` are views of those.
+    They work on the records that were given, in place; ``params``, ``state`` and ``sample`` are views of
+    those.
     """
 
     advance: Callable[[int], None]
@@ -31,6 +32,7 @@ class Kernels:
 
     def __init__(self, params: Record, state: Record, sample: Record) -> None:
         self._alive = {"params": params, "state": state, "sample": sample}
+        self.params: Any = params[0]
         self.state: Any = state[0]
         self.sample: Any = sample[0]
         if not COMPILED:

@@ -12,7 +12,8 @@ import functools
 import json
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ import numpy as np
 from drivers.bus import Frame, Link, unpack_frame
 from drivers.codec import Database
 from drivers.errors import LinkError
+from firmware_model.cia402 import WIRE as CIA402_WIRE
+from firmware_model.cia402 import Cia402Frames
 from firmware_model.config import Record, Wire, new_sample, new_state
 from firmware_model.drive import advance
 from firmware_model.faulty_plant import PlantFaults, advance_open_phase
@@ -39,23 +42,30 @@ from firmware_model.station import (
     station,
 )
 
-Frames = HouseFrames | InverterFrames
+Frames = HouseFrames | InverterFrames | Cia402Frames
 
+Eds = tuple[Path, dict[int, dict[int, bytes]]]
+"""A CANopen node's EDS, and what it has stored."""
 BLACK_BOX = "black box: "
 LOOK_NS = 1_000_000_000
 """So long a busy drive serves the bus without asking whether to stop; a signal asks at once."""
 RUN_OUT_NS = 500_000_000
-Protocol = Literal["house", "inverter"]
+Protocol = Literal["house", "inverter", "cia402"]
 
 
-def frames_of(database: Database, protocol: Protocol = "house", truth: bool = True) -> Frames:
+def frames_of(
+    database: Database, protocol: Protocol = "house", truth: bool = True, eds: Eds | None = None
+) -> Frames:
     """What a drive of this protocol reads and writes. Raises DatabaseError."""
+    if protocol == "cia402":
+        path, stored = eds or (Path(), {})
+        return Cia402Frames(path, database.node.node_id, stored)
     return InverterFrames(truth=truth) if protocol == "inverter" else HouseFrames(database, truth=truth)
 
 
 def wire_of(database: Database, protocol: Protocol = "house") -> Wire:
     """Resolution and range of the measured signals."""
-    return frames_of(database, protocol).wire
+    return CIA402_WIRE if protocol == "cia402" else frames_of(database, protocol).wire
 
 
 def compile_kernels(params: Record, state: Record) -> None:
@@ -79,10 +89,13 @@ class Node:
         period_ns: int,
         truth: bool,
         protocol: Protocol = "house",
+        eds: Path | None = None,
         faults: PlantFaults | None = None,
     ) -> None:
         self._link, self._clock, self._pacing, self._period_ns = link, clock, pacing, period_ns
-        self._make_frames = functools.partial(frames_of, database, protocol, truth)
+        self._make_frames = functools.partial(
+            frames_of, database, protocol, truth, (eds, {}) if eds else None
+        )
         self._frames, self._faults = self._make_frames(), faults
         self._params = params
         self._state = new_state(params, self._frames.counter_modulus - 1)
@@ -123,8 +136,8 @@ class Node:
                 self._attend(self._station, now + LOOK_NS)
                 continue
             if now >= next_beat:
-                next_beat = now + HEARTBEAT_NS
-                self._send(self._frames.beat())
+                next_beat = now + (self._frames.beat_ns or HEARTBEAT_NS)
+                self._send(self._frames.beat() if self._frames.beat_ns else [])
             if self._pacing == "cyclic" and now >= next_cycle:
                 next_cycle += self._period_ns * (1 + (now - next_cycle) // self._period_ns)
                 self.sync(now)
@@ -204,6 +217,9 @@ class Node:
         """Handle one frame, whole or not at all."""
         if frame.can_id | frame.flags != self._frames.sync_id:
             self._frames.take(frame, self._kernels, self._on_command)
+            if due := self._frames.due:
+                self._frames.due = ()
+                self._send(due)
         elif self._pacing == "sync":
             if len(frame.data) > 1:  # CANopen: no data or the counter
                 self.ignored["length"] += 1
@@ -225,7 +241,7 @@ class Node:
             self._faults.after(kernels.state, kernels.sample)
         self._send(self._frames.answer(kernels.sampled()))
 
-    def _send(self, frames: list[Sent]) -> None:
+    def _send(self, frames: Sequence[Sent]) -> None:
         """A drive does not stop for a bus that is down; its watchdog does."""
         for can_id, data, fd in frames:
             try:

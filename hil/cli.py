@@ -17,6 +17,7 @@ from hil.commands import (
     bench,
     campaign,
     config,
+    configure,
     convert,
     demo,
     emulated,
@@ -44,6 +45,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil set w=60 [RUN]           another reference for a running run, within its range
   hil simulate CONFIG          the same without a bus, as fast as the machine goes
   hil check CONFIG             is all ready for that bus and drive? sends nothing
+  hil configure CONFIG         a CANopen CiA 402 drive set up from its EDS; enables nothing
   hil replay LOG               re-run the controller over a log, compare by bits
   hil report LOG [LOG ...]     one page of a run that works offline; several are compared
   hil info LOG, recover LOG    what is in a log; rewrite a damaged one
@@ -65,6 +67,7 @@ MODULES = (
     run,
     watch,
     set_,
+    configure,
     emulated,
     replay,
     report,

@@ -553,6 +553,35 @@ def _cascade() -> Any:
     return adapter.validate_python({"kind": "cascade"})
 
 
+_OBJECT = r"^(0x)?[0-9A-Fa-f]{4}h?((:|sub)[0-9A-Fa-f]{1,2}h?)?$"
+Objects = Annotated[list[Annotated[str, Field(pattern=_OBJECT)]], Field(min_length=1, max_length=8)]
+
+
+class CanopenTable(Table):
+    """A CANopen CiA 402 drive that hil configure sets up by SDO; its node is drive.node_id."""
+
+    eds: str
+    """Path of the drive's EDS or DCF, relative to this file."""
+    mode: Literal["cst", "csv", "csp"] = "cst"
+    """Cyclic synchronous torque, velocity or position (6060h)."""
+    heartbeat_ms: Annotated[int, Field(ge=1, le=65535)] = 100
+    """Period of the drive's heartbeat (1017h)."""
+    rpdo: Annotated[list[Objects], Field(min_length=1, max_length=4)] | None = None
+    """Objects of each PDO to the drive, as [["6040", "6071"]]; left out: the mode's own."""
+    tpdo: Annotated[list[Objects], Field(min_length=1, max_length=4)] | None = None
+    """Objects of each PDO from the drive, as [["6041", "606C", "6077"]]; left out: the mode's own."""
+    sync_period: bool = False
+    """Write the period of SYNC (1006h), for drives that want to know it."""
+    rpdo_timeout_ms: Annotated[int, Field(ge=1, le=65535)] | None = None
+    """Deadline of the command (1400h:5), the drive's own watchdog where it has one; left out: not written."""
+    velocity_unit: str = ""
+    """What 606Ch counts in where 60A9h does not tell: "rpm", "0.001 rpm", "1/4096 rev/s"."""
+    rated_current: Literal["rms", "peak"] | None = None
+    """What the drive's rated current (6075h) is; needed where 6078h is mapped."""
+    answer_timeout_s: Annotated[float, Field(ge=0.01, le=60, allow_inf_nan=False)] = 0.5
+    """How long the drive may take to answer an SDO request."""
+
+
 class FaultsTable(Table):
     """What `hil faults` expects of this configuration: by row, in place of what the shipped matrix does."""
 
@@ -581,6 +610,8 @@ class RunConfig(Table):
     log: LogTable = LogTable()
     criteria: CriteriaTable = CriteriaTable()
     emulator: EmulatorTable | None = None
+    canopen: CanopenTable | None = None
+    """The CANopen drive that hil configure sets up; left out: none."""
     faults: FaultsTable = FaultsTable()
 
 

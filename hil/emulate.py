@@ -38,8 +38,10 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     lockstep = config.loop.clock == "lockstep"
     acted = Counter[int]()
     faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted) if plant.fault else None
-    frames = frames_of(database, plant.protocol)
-    check_spoken(path, config, frames.spoken)
+    eds = folder / plant.eds if plant.eds else None
+    frames = frames_of(database, plant.protocol, eds=(eds, {}) if eds else None)
+    if frames.spoken is not None:
+        check_spoken(path, config, frames.spoken)
     modulus = frames.counter_modulus
     watched = plant.fault or plant.black_box
     node = Node(
@@ -51,6 +53,7 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         period_ns=config.loop.period_ns,
         truth=plant.truth,
         protocol=plant.protocol,
+        eds=eds,
         faults=PlantFaults(plant.fault, params, modulus - 1, acted) if watched else None,
     )
     if faulty is not None:

@@ -13,7 +13,7 @@ PACKAGES = ("hil", "drivers", "firmware_model")
 STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclasses", "math", "typing", "enum"}
 STDLIB_OK |= {"cmath", "functools", "importlib"}
 ROOT_MODULES = ("app", "fused", "cli", "emulate", "simulate", "demo", "check", "faults/case")
-ROOT_MODULES += ("convert/rerun", "campaign/case", "replay/frames", "replay/sent")
+ROOT_MODULES += ("convert/rerun", "campaign/case", "replay/frames", "replay/sent", "configure")
 ROOT_MODULES += ("manual/schema",)
 JIT = "drivers.jit"
 """The one jit module of all: knows neither controller nor drive, so that control may re-export it."""

@@ -1,0 +1,140 @@
+"""Units of a CiA 402 drive's objects, as the drive tells them: rated torque and current, unit of speed.
+
+    torque  = raw / 1000 * 6076h [mN m]      current = raw / 1000 * 6075h [mA]
+    speed   = raw * (unit in 60A9h), CiA 303-2: power of ten, numerator, denominator
+
+Nothing is guessed: what the drive does not tell must stand in the config.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Final
+
+from drivers.errors import DatabaseError, NodeError
+from drivers.sdo import Sdo
+from drivers.units import SPEED, shown, unit_of
+
+RATED_CURRENT, RATED_TORQUE, SPEED_UNIT = 0x6075, 0x6076, 0x60A9
+TORQUES: Final = (0x6071, 0x6072, 0x6074, 0x6077, 0x60B2, 0x60E0, 0x60E1)
+CURRENTS: Final = (0x6073, 0x6078)
+SPEEDS: Final = (0x606B, 0x606C, 0x60B1, 0x60FF)
+VOLTAGE: Final = 0x6079
+_UNITS: Final = {
+    (0xB4, 0x47): "rpm", (0xB4, 0x03): "rev/s", (0x10, 0x03): "rad/s", (0x41, 0x03): "deg/s",
+}  # fmt: skip
+"""CiA 303-2: revolutions, radians, degrees a minute or a second, by numerator and denominator."""
+_CURRENT: Final = {"peak": "A", "rms": "Arms"}
+_TEXT: Final = re.compile(r"\s*(?:(\d+(?:\.\d+)?(?:[eE][+-]?\d+)?)(?:\s*/\s*(\d+))?\s+)?(\S.*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What a raw value is to be multiplied by, and the unit that makes."""
+
+    factor: Fraction
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What the config says of units: of speed ("rpm", "0.001 rpm", "1/4096 rev/s"), of 6075h (rms, peak)."""
+
+    velocity_unit: str = ""
+    rated_current: str = ""
+
+
+def speed_scale(text: str, where: str) -> Scale:
+    """A unit of speed with a factor before it. Raises DatabaseError."""
+    found = _TEXT.fullmatch(text)
+    if found is None or unit_of(found[3], SPEED) is None or found[2] == "0":
+        raise DatabaseError(f'{where} = "{text}": give a unit of {shown(SPEED)}, as "rpm" or "1/4096 rev/s"')
+    return Scale(Fraction(found[1] or "1") / int(found[2] or 1), found[3])
+
+
+def told_speed(raw: int) -> Scale | None:
+    """The unit that 60A9h names; None for one in increments, or one that is unknown."""
+    unit = _UNITS.get((raw >> 16 & 0xFF, raw >> 8 & 0xFF))
+    power = (raw >> 24 ^ 0x80) - 0x80
+    return Scale(Fraction(10) ** power, unit) if unit else None
+
+
+class Scales:
+    """Scale of each object, asked of the node once. Raises DatabaseError for what nobody says."""
+
+    def __init__(self, sdo: Sdo, said: Said) -> None:
+        self._sdo, self._said = sdo, said
+        self._kept: dict[str, Scale] = {}
+        self.told: dict[str, str] = {}
+        """What the node said of them, in words."""
+
+    def of(self, index: int) -> Scale | None:
+        """The scale of an object; None for one that is a plain number."""
+        for indices, kind, ask in (
+            (TORQUES, "rated torque", self._torque),
+            (CURRENTS, "rated current", self._current),
+            (SPEEDS, "unit of speed", self._speed),
+        ):
+            if index in indices:
+                if kind not in self._kept:
+                    self._kept[kind] = ask()
+                return self._kept[kind]
+        return Scale(Fraction(1, 1000), "V") if index == VOLTAGE else None
+
+    def _torque(self) -> Scale:
+        rated = self._rated(RATED_TORQUE, "6076h, rated torque")
+        self.told["rated_torque"] = f"{rated / 1000:g} N m (6076h)"
+        return Scale(Fraction(rated, 10**6), "Nm")
+
+    def _current(self) -> Scale:
+        kind = self._said.rated_current
+        if not kind:
+            raise DatabaseError(
+                'canopen.rated_current: missing; 6078h counts per mille of 6075h: say "rms" or "peak", '
+                "as the drive's manual has it"
+            )
+        rated = self._rated(RATED_CURRENT, "6075h, rated current")
+        self.told["rated_current"] = f"{rated / 1000:g} A {kind} (6075h)"
+        return Scale(Fraction(rated, 10**6), _CURRENT[kind])
+
+    def _rated(self, index: int, what: str) -> int:
+        rated = self._sdo.optional_int(index)
+        if not rated:
+            found = "is 0" if rated == 0 else "is not there"
+            raise NodeError(
+                f"node {self._sdo.node_id}: {what}, {found}; its values count per mille of that: set it "
+                "with the drive's own tool"
+            )
+        return rated
+
+    def _speed(self) -> Scale:
+        given = self._said.velocity_unit
+        raw = self._sdo.optional_int(SPEED_UNIT)
+        told = told_speed(raw) if raw else None
+        said = speed_scale(given, "canopen.velocity_unit") if given else None
+        if told is None and said is None:
+            found = f"60A9h is 0x{raw:08X}, no unit that is known" if raw else "the drive has no 60A9h"
+            raise DatabaseError(
+                f'canopen.velocity_unit: missing, and {found}; say what 606Ch counts in: "rpm", "0.001 rpm", '
+                '"1/4096 rev/s" (608Fh has the increments of a turn)'
+            )
+        if told and said and not _same(told, said):
+            raise DatabaseError(
+                f'canopen.velocity_unit = "{given}", but 60A9h = 0x{raw:08X} says {_words(told)}; leave the '
+                "key out, or set the drive's"
+            )
+        scale = told or said
+        assert scale is not None  # noqa: S101 - one of the two is there
+        self.told["unit_of_speed"] = f"{_words(scale)} ({'60A9h' if told else 'canopen.velocity_unit'})"
+        return scale
+
+
+def _same(one: Scale, other: Scale) -> bool:
+    factors = [unit.factor if (unit := unit_of(scale.unit, SPEED)) else 0.0 for scale in (one, other)]
+    return abs(float(one.factor) * factors[0] / (float(other.factor) * factors[1]) - 1.0) < 1e-12
+
+
+def _words(scale: Scale) -> str:
+    return scale.unit if scale.factor == 1 else f"{float(scale.factor):g} {scale.unit}"
