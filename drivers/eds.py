@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import configparser
 import re
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +48,8 @@ class Dictionary:
         if path.suffix.lower() not in (".eds", ".dcf"):
             raise DatabaseError(f"{path}: is no EDS and no DCF by its name; canopen.eds takes .eds or .dcf")
         try:
-            self._objects: Any = canopen.import_od(str(path), node_id)
+            with warnings.catch_warnings(action="ignore", category=DeprecationWarning):  # of logging's warn
+                self._objects: Any = canopen.import_od(str(path), node_id)
         except OSError as error:
             raise DatabaseError(f"{path}: can't be read: {error.strerror or error}") from error
         except (configparser.Error, ValueError, KeyError, TypeError, UnicodeError) as error:

@@ -252,8 +252,8 @@ class PlantConfig(Table):
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """Number of the drive on the bus."""
     protocol: Literal["house", "inverter", "cia402"] = "house"
-    """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo; cia402:
-    CANopen, mute until hil configure has mapped its PDOs."""
+    """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo;
+    cia402: CANopen, mute until hil configure has mapped its PDOs."""
     eds: str = ""
     """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"

@@ -418,6 +418,22 @@ def check_load(setup: Setup) -> None:
         raise ArmingError(f"bus load {found}; nothing was sent; {LOAD_REMEDY}")
 
 
+def check_set_up(setup: Setup) -> None:
+    """Refuse a CANopen drive that lost what hil configure has set; asks it by SDO. Raises ArmingError."""
+    config = setup.config
+    if config.canopen is None or config.loop.shadow:
+        return
+    from hil.configure import lost
+
+    problems = lost(setup.path, config, bus_settings(config), config.drive.heartbeat_timeout_s)
+    if problems:
+        more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
+        raise ArmingError(
+            f"the drive is not as hil configure sets it: {problems[0]}{more}; set it: hil configure "
+            f"{setup.path}; no SYNC and no command was sent"
+        )
+
+
 def needed_bytes(config: RunConfig) -> int:
     """Disk space that a run of the configured length may take, at least one minute's."""
     seconds = config.loop.duration_s or 60.0
@@ -444,6 +460,7 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
     with _alone(setup), _writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
         compile_kernels(setup)  # while the writer starts
+        check_set_up(setup)
         with _guarding(setup, recorder) as words:
             return _recorded(setup, request, recorder, clock, words)
 

@@ -1,4 +1,7 @@
-"""`hil check`: everything that can be known before arming, as rows of pass, warn or fail. Sends nothing."""
+"""`hil check`: everything that can be known before arming, as rows of pass, warn or fail.
+
+Sends nothing, but for questions by SDO to a drive that has a ``[canopen]`` table.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
-from hil.errors import plain
+from hil.errors import HilError, plain
 from hil.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
 
@@ -38,6 +41,7 @@ def check(setup: Setup) -> list[Row]:
         *reach_rows(setup),
         load_row(setup),
         *heard_rows(setup),
+        *canopen_rows(setup),
         *realtime_rows(config.realtime),
         clock_row(config.loop.period_ns),
         disk_row(log_path(setup, "check"), needed_bytes(config)),
@@ -59,7 +63,9 @@ def passed(rows: list[Row]) -> bool:
 
 def check_table(rows: list[Row]) -> Table:
     """The rows for a terminal."""
-    table = Table(title="hil check (nothing was sent)", title_justify="left")
+    asked = any(r.check == "canopen" for r in rows)
+    sent = "asked by SDO, nothing else was sent" if asked else "nothing was sent"
+    table = Table(title=f"hil check ({sent})", title_justify="left")
     for title in ("check", "verdict", "found", "remedy"):
         table.add_column(title, overflow="fold")
     for r in rows:
@@ -149,6 +155,21 @@ def heard_rows(setup: Setup) -> list[Row]:
     finally:
         link.close()
     return traffic_rows(setup, traffic)
+
+
+def canopen_rows(setup: Setup) -> list[Row]:
+    """One row for a CANopen drive that hil configure has set; it is asked by SDO."""
+    config = setup.config
+    if config.canopen is None:
+        return []
+    from hil.configure import lost
+
+    try:
+        problems = lost(setup.path, config, bus_settings(config), 0.0)
+    except (DriverError, HilError) as error:
+        return [Row("canopen", "fail", str(error), "see what it says; then hil configure, hil check")]
+    found = "; ".join(problems) or f"mode {config.canopen.mode}, every object as hil configure sets it"
+    return [row("canopen", not problems, found, f"set it: hil configure {setup.path}")]
 
 
 def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:

@@ -29,7 +29,9 @@ def register(commands: Commands) -> None:
     command.add_argument("--lockstep", action="store_true", help="the emulator advances by one period a SYNC")
     bus_flags(command)
     command = commands.add(
-        "check", cmd_check, "Check interface, drive, limits, bus load and rights. Sends nothing."
+        "check",
+        cmd_check,
+        "Check interface, drive, limits, bus load and rights. Sends no SYNC and no command.",
     )
     command.add_argument("config", type=Path, metavar="CONFIG", help="run configuration (TOML)")
     bus_flags(command)

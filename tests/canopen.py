@@ -1,0 +1,104 @@
+"""CANopen nodes for tests on hil-local: the emulated drive in a thread, and nodes of the canopen library."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+
+from drivers.bus import BusSettings, Link, open_link
+from drivers.codec import Database
+from firmware_model.config import PlantConfig, build_params
+from firmware_model.node import Node, wire_of
+from hil.config import RunConfig, load_toml
+from hil.configure import Job, job_of
+from tests.conftest import CONFIGS
+
+NODE = 5
+TABLE = """
+[canopen]
+eds = "drives/cia402.eds"
+mode = "cst"
+rpdo_timeout_ms = 20
+"""
+EDS = CONFIGS / "drives" / "cia402.eds"
+
+
+def bus_of(channel: str) -> BusSettings:
+    return BusSettings("hil-local", channel)
+
+
+def run_config(configs: Path) -> Path:
+    """A run configuration with the emulated CiA 402 drive."""
+    path = configs / "canopen.toml"
+    if not path.exists():
+        text = (configs / "demo.toml").read_text(encoding="utf-8")
+        text = text.replace('"drives/hil_pmsm.dbc"\nnode_id = 1', f'"drives/cia402.dbc"\nnode_id = {NODE}')
+        text = text.replace("plants/demo.toml", "plants/cia402.toml")
+        path.write_text(text + TABLE, encoding="utf-8")
+    return path
+
+
+def job(configs: Path, channel: str, *settings: str) -> Job:
+    """The job of that config on a bus of its own."""
+    path = run_config(configs)
+    return job_of(path, load_toml(path, RunConfig, settings), bus_of(channel))
+
+
+@contextlib.contextmanager
+def emulated(configs: Path, channel: str, *settings: str) -> Iterator[Node]:
+    """The shipped emulated CiA 402 drive, served by a thread."""
+    path = configs / "plants" / "cia402.toml"
+    config = load_toml(path, PlantConfig, settings)
+    database = Database(path.parent / config.dbc, config.node_id)
+    link = open_link(bus_of(channel))
+    node = Node(
+        link, database, build_params(config, wire_of(database, "cia402")), clock="lockstep", pacing="sync",
+        period_ns=1_000_000, truth=False, protocol="cia402", eds=path.parent / config.eds,
+    )  # fmt: skip
+    with serving(node.run, link):
+        yield node
+
+
+@contextlib.contextmanager
+def serving(run: Callable[[Callable[[], bool]], None], link: Link) -> Iterator[None]:
+    over = threading.Event()
+    thread = threading.Thread(target=run, args=(over.is_set,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(5)
+        link.close()
+
+
+@contextlib.contextmanager
+def stranger(channel: str, node_id: int = NODE, eds: Path = EDS) -> Iterator[Any]:
+    """A node of the canopen library: SDO server and object dictionary by strangers."""
+    network = canopen.Network()
+    network.connect(interface="hil-local", channel=channel)
+    try:
+        yield network.add_node(canopen.LocalNode(node_id, str(eds)))
+    finally:
+        network.disconnect()
+
+
+@contextlib.contextmanager
+def recorded(channel: str) -> Iterator[list[can.Message]]:
+    """Every frame on a bus."""
+    frames: list[can.Message] = []
+    bus = can.Bus(channel, "hil-local")
+    notifier = can.Notifier(bus, [frames.append])
+    try:
+        yield frames
+        time.sleep(0.05)
+    finally:
+        notifier.stop()
+        bus.shutdown()
