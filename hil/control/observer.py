@@ -138,7 +138,8 @@ def conventional_dob(gamma_c: Array, T_s: float) -> Window:
 def exponentials(lam: Array, theta: Array, N: int) -> Window:
     """One channel of one to three exponentials; lam, theta (k,)."""
     lam, theta = (np.r_[a, np.zeros(3 - len(a))] for a in (lam, theta))
-    lam_N, length = np.where(theta != 0, lam**N, 0.0), np.array([N], np.int64)
+    lam_N = np.array([power(x, N) if weight else 0.0 for x, weight in zip(lam, theta, strict=True)])
+    length = np.array([N], np.int64)
     first, first_N, weights = (np.reshape(a[:2], (2, 1)) for a in (lam, lam_N, theta))
     if theta[2] == 0:
         return Window(first, first_N, weights, length)

@@ -10,17 +10,27 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
-from scipy.linalg import expm
+from scipy.linalg import expm, solve_discrete_are
 
-from hil.control.linalg import exp, halvings_of, integral_exponential, inverse, power
+from hil.control.linalg import cos_sin, exp, halvings_of, integral_exponential, inverse, power, riccati
 from tests.conftest import CONFIGS, ROOT
 
 SCRIPT = """
 import sys
 from pathlib import Path
 from hil.app import Overrides, load_setup
-for name, rate in (("demo", 500), ("demo", 1000), ("demo", 5000), ("paper", 1000), ("inverter", 1000)):
-    setup = load_setup(Path(sys.argv[1]) / f"{name}.toml", Overrides(settings=(f"loop.rate_hz={rate}",)))
+from tests.unit.test_control_registry import LAWS, OBSERVERS, settings
+asked = [("demo", 500, ()), ("demo", 5000, ()), ("paper", 1000, ()), ("inverter", 1000, ())]
+asked += [("demo", 1000, settings(observer=kind)) for kind in OBSERVERS]
+asked += [("demo", 1000, settings(law=kind)) for kind in LAWS]
+noisy = 'kind="{0}", delay_ms=200.0, w_noise_rad_s=0.02, i_noise_a=0.03'.format
+noisy = [noisy("least-noise"), noisy("harmonic-exact") + ", frequency_hz=7.3, lead_ticks=2.0"]
+noisy += ['kind="exponentials", gammas_rad_s=[5.0, 11.0], delay_ms=300.0, w_noise_rad_s=0.02, i_noise_a=0.03']
+noisy += ['kind="eso", bandwidth_rad_s=77.0, damping=1.0', 'kind="eso", bandwidth_rad_s=77.0, damping=1.9']
+asked += [("demo", 1000, ("observer.speed={%s}" % one,)) for one in noisy]
+for name, rate, more in asked:
+    more = Overrides(settings=(f"loop.rate_hz={rate}", *more))
+    setup = load_setup(Path(sys.argv[1]) / f"{name}.toml", more)
     print(setup.machine.to_json(), setup.machine.setpoint.tobytes().hex())
 """
 PROCESSORS = {
@@ -45,7 +55,7 @@ def designed(env: dict[str, str]) -> str:
 @pytest.mark.process
 def test_a_design_has_the_same_bits_under_every_kind_of_blas_and_processor() -> None:
     first, *others = (designed(env) for env in PROCESSORS.values())
-    assert first.count("\n") == 5 and all(other == first for other in others)
+    assert first.count("\n") == 22 and all(other == first for other in others)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -64,7 +74,32 @@ def test_the_exponential_and_its_integral_are_scipys(seed: int) -> None:
     assert np.abs(inverse(Ed) @ Ed - np.eye(n)).max() < 1e-15 * n * np.linalg.cond(Ed) + 1e-14
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_the_riccati_equation_is_solved_as_scipy_does(seed: int) -> None:
+    """A may be unstable where B reaches it; what no input reaches, or Q does not see, is stable."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 6)), int(rng.integers(1, 3))
+    A, B = rng.normal(size=(n, n)), rng.normal(size=(n, m))
+    Q = np.diag(10.0 ** rng.uniform(-6, 3, n))
+    P, wanted = riccati(A, B @ B.T, Q), solve_discrete_are(A, B, Q, np.eye(m))
+
+    def missed(P: np.ndarray) -> float:
+        return float(np.abs(A.T @ P @ np.linalg.solve(np.eye(n) + B @ B.T @ P, A) + Q - P).max() / P.max())
+
+    assert np.abs(P - wanted).max() <= 1e-8 * wanted.max() and (P == P.T).all()
+    assert missed(P) <= 10 * missed(wanted) + 1e-12
+
+
+def test_a_riccati_equation_without_a_solution_has_none() -> None:
+    with np.errstate(all="ignore"):
+        assert not np.isfinite(riccati(np.array([[1.1]]), np.zeros((1, 1)), np.eye(1))).any()
+    assert riccati(np.array([[0.5]]), np.eye(1), np.zeros((1, 1))) == 0.0
+
+
 def test_scalars_are_rounded_right() -> None:
+    assert cos_sin(0.0) == (1.0, 0.0) and cos_sin(-1.5)[1] == -cos_sin(1.5)[1]
+    for x in np.random.default_rng(1).uniform(-1, 1, 200) * 10.0 ** np.arange(-8, 2).repeat(20):
+        assert cos_sin(x) == pytest.approx((math.cos(x), math.sin(x)), rel=4e-16, abs=1e-300)
     assert exp(0.0) == 1.0 and exp(-1e4) == 0.0 and exp(1e4) == np.inf
     with localcontext() as context:
         context.prec = 60

@@ -13,19 +13,20 @@ import numpy as np
 
 from hil.control.errors import ControlDesignError
 from hil.control.fac import sample
-from hil.control.linalg import Array
+from hil.control.linalg import Array, product, riccati, solve
 from hil.control.registry import Key, Law, Plan, Values
 
 
 def lq_gain(A: Array, B: Array, weights: Array) -> Array:
     """K (1, n) of least sum x' diag(weights) x + u^2; B (n, 1). Raises ControlDesignError."""
-    from scipy.linalg import solve_discrete_are  # loads as long as numpy
-
-    try:
-        P = solve_discrete_are(A, B, np.diag(weights), np.eye(1))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ControlDesignError(f"no LQ gain for the weights {weights} ({error}); change them") from None
-    K: Array = np.linalg.solve(np.eye(1) + B.T @ P @ B, B.T @ P @ A)
+    A, B = (np.ascontiguousarray(m) for m in (A, B))
+    across = np.ascontiguousarray(B.T)
+    with np.errstate(all="ignore"):  # what does not converge overflows
+        P = riccati(A, product(B, across), np.diag(weights))
+    if not np.isfinite(P).all():
+        raise ControlDesignError(f"no LQ gain for the weights {weights}; change them")
+    PB = product(P, B)
+    K: Array = solve(np.eye(1) + product(across, PB), product(np.ascontiguousarray(PB.T), A))
     return K
 
 
@@ -51,9 +52,9 @@ MEMBER = Law(
     0,
     design,
     {
-        "speed_weight": Key("weight of the speed error squared; that of u_q^2 is 1", unit="V^2 s^2/rad^2"),
+        "speed_weight": Key("weight of the speed error squared, per V^2 of u_q"),
         "current_weight": Key(
-            "weight of the current error squared", 1e-3, above=None, least=0.0, unit="V^2/A^2"
+            "weight of the current error squared, per V^2 of u_q", 1e-3, above=None, least=0.0
         ),
     },
 )

@@ -5,6 +5,8 @@ Exact for a constant d; lag 0.4 D; its noise is that of a parabola of 0.85 D, 1.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from hil.control.noise import DELAY, ticks_of
@@ -17,7 +19,7 @@ def design(values: Values, channel: Channel) -> Window:
     N = ticks_of(values, channel.T_s)
     s = (np.arange(N) + 1.0) / (N + 1)
     g = s * (1 - s) ** 2
-    return fir(g / g.sum())
+    return fir(g / math.fsum(g.tolist()))
 
 
 MEMBER = Observer("cubic", "s (1 - s)^2: least noise at a given lag", {"delay_ms": DELAY}, design)

@@ -8,20 +8,26 @@ written by what drives it. Lag 2 zeta / w0; never exact.
 
 from __future__ import annotations
 
-import cmath
+import math
 
 import numpy as np
 
+from hil.control.linalg import cos_sin, exp
 from hil.control.observer import Window, linear_filter
 from hil.control.registry import Channel, Key, Observer, Values
 
 
 def design(values: Values, channel: Channel) -> Window:
     """Gains from the poles."""
-    zeta, w0 = values["damping"], values["bandwidth_rad_s"]
-    root = cmath.sqrt(zeta * zeta - 1)
-    l1, l2 = (cmath.exp(-w0 * channel.T_s * (zeta + sign * root)) for sign in (1, -1))
-    return linear_filter(np.array([[(l1 * l2).real]]), np.array([[((1 - l1) * (1 - l2)).real]]))
+    zeta, tick = values["damping"], values["bandwidth_rad_s"] * channel.T_s
+    root = tick * math.sqrt(abs(zeta * zeta - 1))
+    if zeta < 1:
+        cos, sin = cos_sin(root)
+        decay = exp(-zeta * tick)
+        p, q = exp(-2 * zeta * tick), (1 - decay * cos) ** 2 + (decay * sin) ** 2
+    else:
+        p, q = exp(-2 * zeta * tick), (1 - exp(-zeta * tick - root)) * (1 - exp(-zeta * tick + root))
+    return linear_filter(np.array([[p]]), np.array([[q]]))
 
 
 MEMBER = Observer(

@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from hil.control.errors import ControlDesignError
-from hil.control.linalg import exp
-from hil.control.noise import NOISE, noise_matrix, weights_of_noise
+from hil.control.linalg import condition, dot, exp, power, product, solve
+from hil.control.noise import MOST_CONDITION, NOISE, times_noise, weights_of_noise
 from hil.control.observer import Window, exponentials
 from hil.control.registry import Channel, Key, Observer, Values
 
@@ -23,15 +23,15 @@ def design(values: Values, channel: Channel) -> Window:
     if len(gamma) > N:
         raise ControlDesignError(f"D = {values['delay_ms']:g} ms is {N} ticks, fewer than poles; lengthen D")
     lam = np.array([exp(-g * channel.T_s) for g in gamma])
-    E = (1 - lam)[:, None] * lam[:, None] ** np.arange(N)
-    diagonal, neighbour = weights_of_noise(channel, values)
-    inner, c = E @ noise_matrix(N, diagonal, neighbour) @ E.T, 1 - lam**N
-    if np.linalg.cond(inner) > 1e13:
+    powers = np.multiply.accumulate(np.vstack([np.ones(len(lam)), np.tile(lam, (N - 1, 1))]))
+    E, c = (1 - lam) * powers, 1 - np.array([power(x, N) for x in lam])
+    inner = product(np.ascontiguousarray(E.T), times_noise(*weights_of_noise(channel, values), E))
+    if not condition(inner) <= MOST_CONDITION:
         raise ControlDesignError(
             f"poles {gamma.tolist()} rad/s are too close together for D; move them apart"
         )
-    theta = np.linalg.solve(inner, c)
-    return exponentials(lam, theta / (c @ theta), N)
+    theta = solve(inner, c[:, None])[:, 0]
+    return exponentials(lam, theta / dot(c, theta), N)
 
 
 MEMBER = Observer(

@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from hil.control.errors import ControlDesignError
+from hil.control.linalg import cos_sin
 from hil.control.noise import DELAY, NOISE, least_noise, ticks_of, weights_of_noise
 from hil.control.observer import Window, fir
 from hil.control.observers.ramp_exact import LEAD
@@ -25,10 +26,9 @@ def design(values: Values, channel: Channel) -> Window:
     w = 2 * math.pi * values["frequency_hz"] * channel.T_s
     if w >= math.pi:
         raise ControlDesignError(f"frequency_hz = {values['frequency_hz']:g} is above half the loop's rate")
-    j = np.arange(N)
-    m = (np.exp(-1j * w * j) - np.exp(-1j * w * (j + 1))) / (1j * w)
-    at = np.exp(1j * w * values["lead_ticks"])
-    C, b = np.array([np.ones(N), m.real, m.imag]), np.array([1.0, at.real, at.imag])
+    cos, sin = np.array([cos_sin(w * j) for j in range(N + 1)]).T
+    C = np.array([np.ones(N), np.diff(sin) / w, np.diff(cos) / w])
+    b = np.array([1.0, *cos_sin(w * values["lead_ticks"])])
     return fir(least_noise(C, b, *weights_of_noise(channel, values)))
 
 
