@@ -33,6 +33,9 @@ N_MAX: Final = 1024
 CASCADE: Final = 0
 FAC: Final = 1
 PI: Final = 2
+IDENTIFY: Final = 3
+ROWS: Final = 32
+"""Most rows of an experiment."""
 
 LAW_PARAMS: Final = np.dtype(
     [
@@ -72,16 +75,30 @@ LAW_PARAMS: Final = np.dtype(
         ("S", "f8", (3, 3)),
         ("k_p", "f8", 3),
         ("k_i", "f8", 3),
+        ("rows", "i8"),
+        ("passes", "i8"),
+        ("row_q", "f8", ROWS),
+        ("row_d", "f8", ROWS),
+        ("row_w", "f8", ROWS),
+        ("row_slew", "f8", ROWS),
+        ("row_ticks", "i8", ROWS),
+        ("u_start", "f8"),
+        ("u_most", "f8"),
+        ("goal", "f8", 3),
+        ("w_run", "f8"),
+        ("w_wrong", "f8"),
+        ("i_brake", "f8"),
     ],
     align=True,
 )
 """Parameters, from ``shaped`` on neutral at zero: observers of other forms than the pair of exponentials
 (:class:`hil.control.observer.Window`), 1 in ``shaped`` when a channel has one, 1 in ``filtered`` when the law
-takes x_hat; gains of the PI law (w, q, d)."""
+takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`)."""
 
-LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i"), 0.0
-)
+_SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i")
+_TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
+_BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
+LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS), 0.0)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -112,11 +129,17 @@ LAW_STATE: Final = np.dtype(
         ("d_filter", "f8", 3),
         ("x_hat", "f8", 3),
         ("I", "f8", 3),
+        ("row", "i8"),
+        ("row_ticks", "i8"),
+        ("passes", "i8"),
+        ("cut", "i8"),
+        ("level", "f8", 2),
+        ("peak", "f8", 3),
     ],
     align=True,
 )
-"""State; from ``h_3`` on of :func:`shape_step` (third exponential, filter) and the PI law's integrators ``I``
-[A, V, V]."""
+"""State; from ``h_3`` on of :func:`shape_step` (third exponential, filter), the PI law's integrators ``I``
+[A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d."""
 
 Record = npt.NDArray[np.void]
 
@@ -475,6 +498,91 @@ def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
 
 
 @jit
+def identify_law(p: Any, s: Any, w_ref: float) -> None:
+    """An experiment by its table: voltage pulses at rest (``passes`` > 0), or steps of torque by speed.
+
+    It runs while w_ref is ``w_run``; after its last row, on a stop, and past ``goal[0]`` [rad/s] it brakes.
+    """
+    s["u"][0] = 0.0
+    over = w_ref != p["w_run"] or abs(s["x"][0]) > p["goal"][0]
+    if p["passes"] > 0:
+        pulse_law(p, s, over)
+        return
+    if over:
+        s["row"] = p["rows"]
+    s["i_q_ref"] = torque_step(p, s)
+    current_law(p, s)
+
+
+@jit
+def torque_step(p: Any, s: Any) -> float:
+    """i_q* of the row, reached at its slew [A/tick]; the row ends at its speed, or after its ticks.
+
+    A shaft that turns against the first row's torque by ``w_wrong`` gets no torque any more.
+    """
+    w, row = s["x"][0], s["row"]
+    if row == 0 and p["row_q"][0] * w < -abs(p["row_q"][0]) * p["w_wrong"]:
+        s["cut"], s["row"] = 1, p["rows"]
+    if row < p["rows"] and s["row"] == row:
+        q, until = p["row_q"][row], p["row_w"][row]
+        reached = abs(w) <= until if q == 0.0 else (w >= until if q > 0.0 else w <= until)
+        s["row_ticks"] += 1
+        if reached or s["row_ticks"] > p["row_ticks"][row]:
+            s["row"], s["row_ticks"] = row + 1, 0
+    if s["cut"]:
+        return 0.0
+    if s["row"] >= p["rows"]:  # to rest: full torque down to a tenth of the speed, then in proportion
+        return float(-p["i_brake"] * min(max(10.0 * w / p["goal"][0], -1.0), 1.0))
+    most = p["row_slew"][s["row"]]
+    return float(min(max(p["row_q"][s["row"]], s["i_q_ref"] - most), s["i_q_ref"] + most))
+
+
+@jit
+def pulse_law(p: Any, s: Any, over: bool) -> None:
+    """u = row times level; a row whose current reaches 1.3 times its goal is cut short."""
+    s["u"][1], s["u"][2] = 0.0, 0.0
+    s["i_q_ref"] = 0.0
+    if over or s["passes"] >= p["passes"] or s["row"] >= p["rows"]:
+        s["passes"] = p["passes"]
+        return
+    for c in range(3):
+        s["peak"][c] = max(s["peak"][c], abs(s["x"][c]))
+        if c > 0 and abs(s["x"][c]) > 1.3 * p["goal"][c]:
+            s["cut"] = 1
+    if s["row_ticks"] >= p["row_ticks"][s["row"]]:
+        s["row"], s["row_ticks"], s["cut"] = s["row"] + 1, 0, 0
+        if s["row"] >= p["rows"]:
+            end_pass(p, s)
+            if s["passes"] >= p["passes"]:
+                return
+    s["row_ticks"] += 1
+    for c in range(2):
+        s["level"][c] = max(s["level"][c], p["u_start"])
+    if s["cut"] == 0:
+        s["u"][1] = p["row_q"][s["row"]] * s["level"][0]
+        s["u"][2] = p["row_d"][s["row"]] * s["level"][1]
+
+
+@jit
+def end_pass(p: Any, s: Any) -> None:
+    """Raise the levels to where the peaks come to 0.9 of their goals, at most fourfold; near it vary them.
+
+    Levels that differ let the steps of the wire average out.
+    """
+    peak, goal, level = s["peak"], p["goal"], s["level"]
+    for c in range(2):
+        ratio = goal[1 + c] / max(peak[1 + c], 0.01 * goal[1 + c])
+        if c == 0:  # torque turns the shaft
+            ratio = min(ratio, 0.3 * goal[0] / max(peak[0], 0.003 * goal[0]))
+        factor = 0.93 if 1.0 <= ratio < 1.6 else min(max(0.9 * ratio, 0.25), 4.0)
+        level[c] = min(level[c] * factor, p["u_most"])
+    for c in range(3):
+        peak[c] = 0.0
+    s["row"] = 0
+    s["passes"] += 1
+
+
+@jit
 def to_circle(s: Any, u_limit: float) -> None:
     """Limit (u_q, u_d) to the voltage circle, u_d first: it keeps the field, u_q gets what is left."""
     s["u"][2] = min(max(s["u"][2], -u_limit), u_limit)
@@ -500,6 +608,8 @@ def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: fl
         fac_law(p, s, w_ref, dw_ref, i_q_ref)
     elif p["kind"] == PI:
         pi_law(p, s, w_ref, dw_ref, u_limit)
+    elif p["kind"] == IDENTIFY:
+        identify_law(p, s, w_ref)
     else:
         s["i_q_ref"] = speed_law(p, s, w_ref, dw_ref)
         current_law(p, s)

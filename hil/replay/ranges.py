@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil.control.fac import MAX_GAP
-from hil.control.law import N_MAX, PI
+from hil.control.law import IDENTIFY, N_MAX, ROWS
 from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.guard import MOST_MESSAGES
@@ -18,7 +18,13 @@ COUNTERS: Final = 256
 """Commands that the supervisor remembers: the range of a counter on the wire."""
 RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
     "safety": {"counter_modulus": (1, COUNTERS), "messages": (0, MOST_MESSAGES)},
-    "law": {"kind": (0, PI), "max_gap": (1, MAX_GAP), "N": (0, N_MAX - 1), "form": (0, FILTER)},
+    "law": {
+        "kind": (0, IDENTIFY),
+        "max_gap": (1, MAX_GAP),
+        "N": (0, N_MAX - 1),
+        "form": (0, FILTER),
+        "rows": (0, ROWS),
+    },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},
     "law_state": {
@@ -26,6 +32,7 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "gap": (0, MAX_GAP),
         "started": (0, 1),
         "filled": (0, N_MAX),
+        "row": (0, ROWS),
     },
 }
 

@@ -1,0 +1,277 @@
+"""From the ticks of runs to a motor's parameters: what they tell, how well, and what is odd about them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+
+from hil.control.law import MotorModel
+from hil.control.linalg import Array
+from hil.identify.data import SHORTEST, Samples, joined, samples_of, turning
+from hil.identify.fit import Fit, Shaft, fit, frozen
+from hil.identify.model import B_F, COULOMB, L_D, L_Q, LOAD, PSI_F, R_S, Flags, J
+from hil.identify.shaft import calm, rough, times
+from hil.signals import TickArray
+
+MOST_DELAY: Final = 4
+MOST_SEGMENTS: Final = 150
+"""Of a long log so many segments are taken, evenly spread."""
+TOLD: Final = 0.25
+"""Half-width, as a share of the value, from which on a parameter counts as not told."""
+BROKEN: Final = 4.0
+"""A segment is left out when its speed is so many times further off than the usual one's."""
+
+UNITS: Final = {
+    "R_s": "ohm", "L_d": "H", "L_q": "H", "psi_f": "Wb", "k_t": "N m/A", "J": "kg m2", "B_f": "N m s",
+    "coulomb": "N m", "load": "N m", "delay": "ticks",
+    "w_noise": "rad/s", "i_q_noise": "A", "i_d_noise": "A",
+}  # fmt: skip
+PLACES: Final = {
+    "R_s": R_S, "L_d": L_D, "L_q": L_Q, "psi_f": PSI_F, "J": J, "B_f": B_F, "coulomb": COULOMB, "load": LOAD,
+}  # fmt: skip
+EXCITES: Final = {
+    "R_s": "a current that stands for a few L/R",
+    "L_d": "steps of u_d (step standstill)",
+    "L_q": "steps of u_q (step standstill)",
+    "psi_f": "a shaft that turns (step spinning)",
+    "J": "run-up under torque (step inertia)",
+    "B_f": "run-down over a range of speeds (step inertia)",
+    "coulomb": "run-down over a range of speeds (step inertia)",
+    "load": "runs in both directions (step inertia)",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A value with its 95 % interval; ``told`` False: the data do not tell it, and ``why``."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+    told: bool = True
+    why: str = ""
+
+    @property
+    def half(self) -> float:
+        """Half the interval."""
+        return 0.5 * (self.high - self.low)
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        out: dict[str, Any] = {"value": self.value, "low": self.low, "high": self.high, "unit": self.unit}
+        return out | {"told": self.told} | ({"why": self.why} if self.why else {})
+
+
+@dataclass(slots=True)
+class Estimate:
+    """Parameters by name; ``findings``: what is odd; ``faults``: what a person must look at first.
+
+    ``white``: p-values of the residuals' whiteness by output. ``samples`` and ``fit`` are for a report.
+    """
+
+    parameters: dict[str, Parameter] = field(default_factory=dict)
+    findings: list[str] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    white: dict[str, float] = field(default_factory=dict)
+    samples: Samples | None = None
+    fit: Fit | None = None
+
+    def put(self, name: str, value: float, half: float, why: str = "") -> None:
+        """Note a parameter with its half-width."""
+        self.parameters[name] = Parameter(value, value - half, value + half, UNITS[name], not why, why)
+
+
+def estimate(runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> Estimate:
+    """What the runs tell of the motor; ``guess`` starts the search and gives n_p."""
+    out = Estimate()
+    parts = [part for part in (samples_of(ticks, T_s) for ticks in runs) if len(part) >= SHORTEST]
+    if not parts:
+        out.faults.append("no samples with the gates on and an unbroken past: nothing to estimate from")
+        return out
+    everything = joined(parts)
+    samples = thinned(excited(everything.with_free(turning(everything))))
+    if len(samples) < 50:
+        _at_rest(out, everything)
+        return out
+    samples, shaft = _without_disturbed(out, samples, guess)
+    found = _fitted(out, samples, guess, shaft)
+    _note_parameters(out, found, guess)
+    _note_noise(out, everything)
+    _note_delay(out, runs, T_s, guess)
+    _note_pole_pairs(out, guess)
+    return out
+
+
+def excited(samples: Samples) -> Samples:
+    """Without the segments in which nothing happens: shaft at rest, currents within their noise."""
+    if len(samples) == 0:
+        return samples
+    noise = np.array([step_of(column) for column in samples.y[:, 1:].T])
+    seg, size = samples.segment, np.zeros((int(samples.segment[-1]) + 1, 2))
+    np.maximum.at(size, seg, np.abs(samples.y[:, 1:]) / noise)
+    moves = np.bincount(seg, samples.free) > 0
+    return samples.segments(moves | (size > 12.0).any(axis=1))
+
+
+def step_of(column: Array) -> float:
+    """Usual change from sample to sample, at least one step of the resolution."""
+    steps = np.abs(np.diff(column))
+    return float(max(np.median(steps), steps[steps > 0].min(initial=math.inf))) if steps.any() else 1e-12
+
+
+def thinned(samples: Samples) -> Samples:
+    """Of very many segments some, evenly spread, turning ones and others."""
+    if len(samples) == 0:
+        return samples
+    first = samples.free[samples.begins]
+    keep = np.zeros(len(first), bool)
+    for kind in (first, ~first):
+        rows = np.flatnonzero(kind)
+        keep[rows[:: max(1, math.ceil(len(rows) / MOST_SEGMENTS))]] = True
+    return samples.segments(keep)
+
+
+def _without_disturbed(out: Estimate, samples: Samples, guess: MotorModel) -> tuple[Samples, Shaft]:
+    """The samples without the segments in which another load acted; friction and load of the rest."""
+    free = samples.segments(samples.free[samples.begins])
+    if len(free) < 50:
+        return samples, Shaft()
+    start = rough(free, guess)
+    good = calm(free, guess)
+    kept = samples.free[samples.begins].copy()
+    kept[kept] = good
+    for begin, end in times(free, ~good):
+        out.findings.append(f"left out: another load between {begin:.2f} and {end:.2f} s")
+    return samples.segments(kept | ~samples.free[samples.begins]), start
+
+
+def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) -> Fit:
+    """The fit, again without what it shows to be disturbed."""
+    found = fit(samples, guess, shaft)
+    for _ in range(3):
+        size = np.bincount(samples.segment)
+        spread = np.sqrt(np.bincount(samples.segment, found.residual[:, 0] ** 2) / size)
+        free = samples.free[samples.begins]
+        usual = float(np.median(spread[free])) if free.any() else 0.0
+        bad: Flags = free & (spread > BROKEN * usual)
+        if not bad.any() or (free & ~bad).sum() < 3:
+            break
+        for begin, end in times(samples, bad):
+            out.findings.append(f"left out: the load changed between {begin:.2f} and {end:.2f} s")
+        samples = samples.segments(~bad)
+        found = fit(samples, _as_motor(found, guess), Shaft(found.value[COULOMB], found.value[LOAD]))
+    out.samples, out.fit = samples, found
+    out.white = dict(zip(("w", "i_q", "i_d"), (float(p) for p in found.white), strict=True))
+    return found
+
+
+def _as_motor(found: Fit, guess: MotorModel) -> MotorModel:
+    """The fit as a motor."""
+    v = [float(x) for x in found.value]
+    return MotorModel(v[R_S], v[L_D], v[L_Q], v[PSI_F] or guess.psi_f, guess.n_p, v[J], v[B_F])
+
+
+def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
+    fastest = float(np.abs(out.samples.y[:, 0]).max()) if out.samples else 0.0
+    friction = abs(float(found.value[COULOMB])) + abs(float(found.value[B_F])) * fastest
+    for name, place in PLACES.items():
+        value, half = float(found.value[place]), float(found.half[place])
+        told = half <= TOLD * abs(value)
+        if place in (B_F, COULOMB, LOAD):  # 0 is a value like any other
+            told = bool(found.told[place] > 0.5)
+            told &= half * (fastest if place == B_F else 1.0) <= max(TOLD * abs(value), 0.1 * friction)
+        out.put(name, value, half, "" if told else f"not told by this excitation: it takes {EXCITES[name]}")
+    psi, k = out.parameters["psi_f"], 1.5 * guess.n_p
+    out.put("k_t", k * psi.value, k * psi.half, psi.why)
+    if psi.told and psi.value < 0:
+        out.faults.append(
+            "the back-EMF has the wrong sign: the encoder counts the wrong way, or two phases are swapped"
+        )
+    L_d, L_q = out.parameters["L_d"], out.parameters["L_q"]
+    if L_d.told and L_q.told and L_d.low <= L_q.high and L_q.low <= L_d.high and out.samples:
+        peak = float(np.abs(out.samples.y[:, 1:]).max())
+        out.findings.append(f"L_d and L_q can't be told apart with currents up to {peak:.3g} A")
+    load = out.parameters["load"]
+    if load.told and abs(load.value) > load.half + 0.05 * abs(out.parameters["coulomb"].value):
+        out.findings.append(f"a load of {load.value:.3g} N m acts on the shaft all the time")
+
+
+def _note_noise(out: Estimate, samples: Samples) -> None:
+    """Deviations of the noise, resolution included: what the model leaves, the speed's else at rest."""
+    assert out.fit is not None  # noqa: S101 - called after it
+    sigma = out.fit.sigma.copy()
+    if not np.isfinite(sigma[0]):
+        sigma[0] = float(np.std(samples.y[:, 0] - np.median(samples.y[:, 0])))
+    for name, value in zip(("w_noise", "i_q_noise", "i_d_noise"), sigma, strict=True):
+        out.put(name, float(value), 1.96 * float(value) / math.sqrt(2 * len(samples)))
+
+
+def _at_rest(out: Estimate, samples: Samples) -> None:
+    """Of a drive in which nothing happens the noise alone can be told, and whether something turns it."""
+    spread, mean = np.std(samples.y, axis=0), np.mean(samples.y, axis=0)
+    for name, value in zip(("w_noise", "i_q_noise", "i_d_noise"), spread, strict=True):
+        out.put(name, float(value), 1.96 * float(value) / math.sqrt(2 * len(samples)))
+    for name, how in EXCITES.items():
+        out.parameters[name] = Parameter(math.nan, math.nan, math.nan, UNITS[name], False, f"it takes {how}")
+    if abs(mean[0]) > 6.0 * spread[0]:
+        out.findings.append(f"the shaft turns at {mean[0]:.3g} rad/s without current: a load drives it")
+
+
+def _note_delay(out: Estimate, runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> None:
+    """Ticks from sending a voltage to its effect: the shift under which the currents fit best."""
+    assert out.fit is not None  # noqa: S101 - called after it
+    motor = _as_motor(out.fit, guess)
+    cost = [_shifted(runs, T_s, out.fit, motor, d) for d in range(MOST_DELAY + 1)]
+    best = int(np.argmin(cost))
+    others = min(value for d, value in enumerate(cost) if d != best)
+    why = "" if others > 1.1 * cost[best] else "the voltage hardly changes: the delay can't be told"
+    out.put("delay", float(best), 0.0, why)
+    own = _shifted(runs, T_s, out.fit, motor, None)
+    if not why and cost[best] < 0.7 * own:
+        out.findings.append(
+            f"the echo of the commands lags: with a delay of {best} ticks the currents fit "
+            f"{own / cost[best]:.1f} times better"
+        )
+
+
+def _shifted(
+    runs: Sequence[TickArray], T_s: float, found: Fit, motor: MotorModel, delay: int | None
+) -> float:
+    """RMS of the currents' residual with the voltages of so many ticks before, the speed as measured."""
+    parts = [part for part in (samples_of(run, T_s, delay) for run in runs) if len(part) >= SHORTEST]
+    if not parts:
+        return math.inf
+    samples = excited(joined(parts).tidy())
+    if len(samples) == 0:
+        return math.inf
+    residual = frozen(thinned(samples), motor, found.sigma)
+    return float(np.sqrt(np.mean(residual[:, 1:] ** 2)))
+
+
+def _note_pole_pairs(out: Estimate, guess: MotorModel) -> None:
+    """n_p by the cross-coupling of the currents in a turning motor; psi_f n_p alone can't tell it."""
+    assert out.samples is not None and out.fit is not None  # noqa: S101 - called after them
+    samples, found = out.samples, out.fit
+    current = float(np.abs(samples.y[samples.free, 1]).max()) if samples.free.any() else 0.0
+    if not out.parameters["psi_f"].told or current < 30 * float(found.sigma[1:].max()):
+        return
+    fast = samples.segments(samples.free[samples.begins])
+    own = _as_motor(found, guess)
+    costs = {}
+    for n in range(1, 2 * guess.n_p + 5):
+        motor = replace(own, n_p=n, psi_f=own.psi_f * guess.n_p / n)
+        costs[n] = float(np.mean(frozen(fast, motor, found.sigma)[:, 2] ** 2))
+    best = min(costs, key=lambda n: costs[n])
+    if costs[best] < 0.9 * costs[guess.n_p]:
+        out.faults.append(f"the cross-coupling of the currents is that of {best} pole pairs, not {guess.n_p}")
+
+
+def residuals(out: Estimate) -> Array:
+    """Residuals (N, 3) of the fit."""
+    assert out.fit is not None  # noqa: S101 - asked for after a fit
+    return out.fit.residual

@@ -1,0 +1,152 @@
+"""The exact sampled motor as an output-error predictor: speed and currents from known voltages.
+
+State x = (w, i_q, i_d) under a voltage that is constant over a period, T_c the Coulomb friction:
+    J dw/dt     = 1.5 n_p (psi_f + (L_d - L_q) i_d) i_q - B_f w - T_c sgn(w) - T_0
+    L_q di_q/dt = u_q - R_s i_q - n_p w (L_d i_d + psi_f)
+    L_d di_d/dt = u_d - R_s i_d + n_p w L_q i_q
+In the products the measured w and i_d stand, their mean over the period; all else is simulated, so that the
+back-EMF carries no noise of the speed. That is linear in where a segment starts: each sample is a forced
+response and one column for each start. Where the shaft may stick, the measured speed is taken throughout.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from hil.control.jit import jit
+from hil.control.linalg import Array
+
+Flags = npt.NDArray[np.bool_]
+TERMS: Final = 8
+R_S, L_D, L_Q, PSI_F, J, B_F, COULOMB, LOAD, N_P = range(9)
+"""Places of the parameters in the model's vector."""
+
+
+@jit
+def product_3(a: Array, b: Array, out: Array) -> None:
+    """out = a b, 3 by 3; out is neither."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@jit
+def sampled(A: Array, T: float, E: Array, I: Array, work: Array) -> None:  # noqa: E741
+    """E = e^{A T}, I = int_0^T e^{A s} ds, as :func:`hil.control.linalg.integral_exponential`, in place."""
+    norm = 0.0
+    for i in range(3):
+        norm = max(norm, abs(A[i, 0]) + abs(A[i, 1]) + abs(A[i, 2]))
+    halvings = max(0, math.frexp(norm * T)[1] + 1)
+    h = T / 2.0**halvings
+    I[:, :] = 0.0
+    for k in range(TERMS, 0, -1):
+        product_3(A, I, work)
+        for i in range(3):
+            for j in range(3):
+                I[i, j] = work[i, j] * h / (k + 1.0)
+            I[i, i] += 1.0
+    for i in range(3):
+        for j in range(3):
+            I[i, j] *= h
+    for n in range(halvings + 1):
+        product_3(A, I, E)
+        for i in range(3):
+            E[i, i] += 1.0
+        if n < halvings:
+            product_3(E, I, work)
+            for i in range(3):
+                for j in range(3):
+                    I[i, j] += work[i, j]
+
+
+@jit
+def fill_matrix(p: Array, w: float, i_d: float, free: bool, A: Array) -> None:
+    """A at the speed and the i_d of a period; with the speed given its row is zero."""
+    n_p = p[N_P]
+    A[0, 0] = -p[B_F] / p[J] if free else 0.0
+    A[0, 1] = 1.5 * n_p * (p[PSI_F] + (p[L_D] - p[L_Q]) * i_d) / p[J] if free else 0.0
+    A[1, 0], A[1, 1], A[1, 2] = -n_p * p[PSI_F] / p[L_Q], -p[R_S] / p[L_Q], -n_p * w * p[L_D] / p[L_Q]
+    A[2, 1], A[2, 2] = n_p * w * p[L_Q] / p[L_D], -p[R_S] / p[L_D]
+
+
+@jit
+def begin(w: float, free: bool, z: Array) -> None:
+    """Columns of a segment's first sample: forced, then from each start; a given speed needs no start."""
+    z[:, :] = 0.0
+    z[0, 0] = 0.0 if free else w
+    z[1, 0] = 1.0 if free else 0.0
+    z[2, 1], z[3, 2] = 1.0, 1.0
+
+
+@jit
+def responses(p: Array, T: float, y: Array, u: Array, begins: Flags, free: Flags, z: Array) -> None:
+    """Fill z (N, 4, 3): forced response and those from w, i_q, i_d = 1.
+
+    y (N, 3): measured w, i_q, i_d; u (N, 2): (u_q, u_d) over the past period; begins: where segments start;
+    free: where the speed is simulated.
+    """
+    A, E, I, work = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))  # noqa: E741
+    c = np.zeros(3)
+    for k in range(y.shape[0]):
+        if begins[k]:
+            begin(y[k, 0], free[k], z[k])
+            continue
+        w, i_d = 0.5 * (y[k - 1, 0] + y[k, 0]), 0.5 * (y[k - 1, 2] + y[k, 2])
+        fill_matrix(p, w, i_d, free[k], A)
+        sampled(A, T, E, I, work)
+        way = 1.0 if w > 0.0 else -1.0
+        c[0] = -(p[COULOMB] * way + p[LOAD]) / p[J] if free[k] else (y[k, 0] - y[k - 1, 0]) / T
+        c[1], c[2] = u[k, 0] / p[L_Q], u[k, 1] / p[L_D]
+        if not free[k]:  # mean of w over the period by both ends and the torque's change: T^2 w'' / 12 less
+            bend = T * 1.5 * p[N_P] * p[PSI_F] / p[J] * (y[k, 1] - y[k - 1, 1]) / 12.0
+            c[1] += p[N_P] * p[PSI_F] * bend / p[L_Q]
+        for i in range(3):
+            for n in range(4):
+                z[k, n, i] = E[i, 0] * z[k - 1, n, 0] + E[i, 1] * z[k - 1, n, 1] + E[i, 2] * z[k - 1, n, 2]
+            z[k, 0, i] += I[i, 0] * c[0] + I[i, 1] * c[1] + I[i, 2] * c[2]
+
+
+@jit
+def solve_3(a: Array, b: Array) -> None:
+    """b <- a^-1 b for a symmetric a; a start that nothing depends on stays 0."""
+    for c in range(3):
+        if a[c, c] < 1e-12:
+            a[c, :] = 0.0
+            a[:, c] = 0.0
+            a[c, c], b[c] = 1.0, 0.0
+        for i in range(c + 1, 3):
+            share = a[i, c] / a[c, c]
+            for j in range(c, 3):
+                a[i, j] -= share * a[c, j]
+            b[i] -= share * b[c]
+    for c in range(2, -1, -1):
+        for j in range(c + 1, 3):
+            b[c] -= a[c, j] * b[j]
+        b[c] /= a[c, c]
+
+
+@jit
+def outputs(y: Array, z: Array, begins: Flags, weight: Array, out: Array) -> None:
+    """out (N, 3): every segment from the start that fits y best, weighted by weight (3,)."""
+    a, b, N, k = np.zeros((3, 3)), np.zeros(3), y.shape[0], 0
+    while k < N:
+        end = k + 1
+        while end < N and not begins[end]:
+            end += 1
+        a[:, :], b[:] = 0.0, 0.0
+        for j in range(k, end):
+            for i in range(3):
+                g = weight[i] * weight[i]
+                for n in range(3):
+                    b[n] += g * z[j, n + 1, i] * (y[j, i] - z[j, 0, i])
+                    for m in range(3):
+                        a[n, m] += g * z[j, n + 1, i] * z[j, m + 1, i]
+        solve_3(a, b)
+        for j in range(k, end):
+            for i in range(3):
+                out[j, i] = z[j, 0, i] + b[0] * z[j, 1, i] + b[1] * z[j, 2, i] + b[2] * z[j, 3, i]
+        k = end

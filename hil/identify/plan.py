@@ -1,0 +1,181 @@
+"""The experiments: which steps there are, what the shaft will do, and the run configuration of each.
+
+Every step is a run like any other, by the ``identify`` law: same loop, guard, supervisor, guardian and log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pydantic import TypeAdapter
+
+from hil.config import ControllerTable, MotorTable, ObserverTable, RunConfig, StepReference
+from hil.errors import HilError
+
+STEPS: Final = ("sensors", "standstill", "spinning", "inertia")
+PASSES: Final = 14
+SPEED_SHARE: Final = 0.6
+"""Speed of the experiments as a share of w_max_rad_s and of what the voltage gives."""
+CURRENT_SHARE: Final = 0.5
+"""Torque current of the experiments as a share of i_max_a."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One run: its name, what it does in words, its table of the ``identify`` law, its length [s]."""
+
+    name: str
+    words: str
+    controller: dict[str, Any]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """A step that the limits do not allow, and which."""
+
+    name: str
+    why: str
+
+
+def chosen(text: str | None) -> tuple[str, ...]:
+    """The steps that were asked for, in their order. Raises HilError for one there is not."""
+    names = [name.strip() for name in text.split(",") if name.strip()] if text is not None else list(STEPS)
+    unknown = [name for name in names if name not in STEPS]
+    if unknown or not names:
+        raise HilError(f"--steps: no step {', '.join(unknown) or text!r}; there are {', '.join(STEPS)}")
+    return tuple(name for name in STEPS if name in names)
+
+
+def _rows(*rows: tuple[float, float, float, float, float]) -> dict[str, Any]:
+    """(q, d, w, slew, for) of each row as the law's columns."""
+    names = ("q", "d", "w_rad_s", "slew_a_s", "for_s")
+    return {name: [float(row[j]) for row in rows] for j, name in enumerate(names)}
+
+
+def top_speed(config: RunConfig, motor: MotorTable) -> float:
+    """Speed of the experiments [rad/s]: within w_max, and within half the voltage by the believed psi_f."""
+    by_voltage = 0.8 * config.limits.u_max_v / (motor.n_p * motor.psi_f_wb)
+    return SPEED_SHARE * min(config.limits.w_max_rad_s, by_voltage)
+
+
+def sensors(config: RunConfig, motor: MotorTable) -> Step:
+    """At rest without voltage: noise, resolution, and whether something drives the shaft."""
+    table = _rows((0, 0, 0, 0, 0.3)) | {"passes": 1.0, "w_most_rad_s": config.limits.w_max_rad_s}
+    return Step("sensors", "no voltage; the shaft stays where it is", table, 0.3)
+
+
+def _pulses(T: float) -> list[tuple[float, float, float, float, float]]:
+    """Rows of one pass: long pulses along d for R_s and L_d, short ones along q that leave no speed."""
+    on, off, short = 0.03, 0.05, max(0.003, 2 * T)
+    d: list[tuple[float, float]] = [(1, on), (0, off), (-1, on), (0, off)]
+    d += [(sign, n * short) for sign, n in ((1, 1), (-1, 2), (1, 3), (-1, 3), (1, 2), (-1, 1))]
+    q: list[tuple[float, float]] = [(1, short), (-1, 2 * short), (1, short), (0, 6 * short)]
+    q += [(-1, short), (1, 2 * short), (-1, short), (0, 6 * short)]
+    return [(0, u, 0, 0, t) for u, t in d] + [(0, 0, 0, 0, 0.02)] + [(u, 0, 0, 0, t) for u, t in q]
+
+
+def standstill(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Voltage pulses along d and q that grow until the currents reach half their limits."""
+    limits, T = config.limits, 1.0 / config.loop.rate_hz
+    i_d = min(CURRENT_SHARE * limits.i_max_a, 0.7 * (limits.i_d_max_a or limits.i_max_a))
+    most = 0.45 * min(2.0 * limits.u_max_v, limits.du_max_v)
+    rows = _pulses(T)
+    table = _rows(*rows) | {
+        "passes": float(PASSES),
+        "u_start_v": most / 1000.0,
+        "u_most_v": most,
+        "i_q_goal_a": 0.8 * CURRENT_SHARE * limits.i_max_a,
+        "i_d_goal_a": i_d,
+        "w_most_rad_s": 0.5 * limits.w_max_rad_s,
+    }
+    words = f"voltage pulses up to {i_d:.3g} A along d, short ones along q; the shaft trembles"
+    return Step("standstill", words, table, PASSES * sum(row[4] for row in rows))
+
+
+def _torque(config: RunConfig, motor: MotorTable) -> dict[str, Any]:
+    """What both turning steps share."""
+    w = top_speed(config, motor)
+    return {
+        "w_most_rad_s": min(1.4 * w, 0.95 * config.limits.w_max_rad_s),
+        "w_wrong_rad_s": 0.05 * w,
+        "current_pole_rad_s": 0.2 * config.loop.rate_hz,
+    }
+
+
+def spinning(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Torque that grows slowly until the shaft turns; then it coasts."""
+    w, i = top_speed(config, motor), CURRENT_SHARE * config.limits.i_max_a
+    seconds = 2.5
+    rows = ((i, 0, 0.6 * w, i / seconds, seconds), (0, 0, 0.2 * w, 1e6, 0.5))
+    table = _rows(*rows) | _torque(config, motor) | {"i_brake_a": 0.2 * i}
+    words = f"torque grows up to {i:.3g} A until the shaft turns at {0.6 * w:.3g} rad/s, forward, then coasts"
+    return Step("spinning", words, table, seconds + 0.5 + 1.5)
+
+
+def inertia(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Run-up and run-down in both directions, coasting between."""
+    w, most = top_speed(config, motor), CURRENT_SHARE * config.limits.i_max_a
+    k_t = 1.5 * motor.n_p * motor.psi_f_wb
+    i = min(max(motor.J_kg_m2 * w / (0.3 * k_t), 0.2 * most), most)
+    rows = []
+    for share in (1.0, -1.0, 0.6, -0.6):
+        q = share * i
+        rows += [(q, 0, w * share / abs(share), 20 * i, 1.5), (0, 0, 0.15 * w, 20 * i, 0.7)]
+    table = _rows(*rows) | _torque(config, motor) | {"i_brake_a": 0.5 * i}
+    words = f"run-up to {w:.3g} rad/s and run-down, in both directions, with up to {i:.3g} A"
+    return Step("inertia", words, table, 4 * 2.2 + 1.5)
+
+
+MAKE: Final[dict[str, Callable[[RunConfig, MotorTable], Step | Skipped]]] = {
+    "sensors": sensors,
+    "standstill": standstill,
+    "spinning": spinning,
+    "inertia": inertia,
+}
+
+
+def make(name: str, config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """A step with what is believed of the motor so far; Skipped when a limit does not allow it."""
+    limits, w = config.limits, top_speed(config, motor)
+    continuous = limits.i_continuous_a
+    if name in ("spinning", "inertia") and w < 20.0 * _still(config):
+        return Skipped(name, f"limits allow {w:.3g} rad/s, too slow to tell from noise: w_max_rad_s, u_max_v")
+    if name == "inertia" and continuous and limits.i2t_max_a2s:
+        excess = (CURRENT_SHARE * limits.i_max_a) ** 2 - continuous**2
+        if 6.0 * excess > limits.i2t_max_a2s:
+            return Skipped(name, f"i2t_max_a2s = {limits.i2t_max_a2s:g} allows no run-up of 6 s")
+    return MAKE[name](config, motor)
+
+
+def _still(config: RunConfig) -> float:
+    return 1e-3 * config.limits.w_max_rad_s
+
+
+def config_of(config: RunConfig, step: Step, motor: MotorTable, log_name: str) -> RunConfig:
+    """The run of a step. Its currents and speed are no reference's, so what judges those is left out:
+
+    following_error_rad_s, and where i_d is driven i_d_max_a and open_phase_min_a. All other limits stay.
+    """
+    turns = step.controller.get("passes", 0.0) == 0.0
+    w_run = top_speed(config, motor) if turns else 1e-3
+    adapter: Any = TypeAdapter(ControllerTable)
+    controller = adapter.validate_python({"kind": "identify", "w_run_rad_s": w_run, **step.controller})
+    D = 15e3 / config.loop.rate_hz  # ms: 15 ticks
+    window = {"kind": "ftdob", "gamma_1_rad_s": 300.0 / D, "gamma_2_rad_s": 700.0 / D, "delay_ms": D}
+    dropped: dict[str, Any] = {"following_error_rad_s": None}
+    if not turns:
+        dropped |= {"i_d_max_a": None, "open_phase_min_a": None}
+    changes = {
+        "motor": motor,
+        "controller": controller,
+        "observer": ObserverTable.model_validate({"speed": window, "current": window}),
+        "limits": config.limits.model_copy(update=dropped),
+        "reference": StepReference(kind="step", w_rad_s=w_run),
+        "loop": config.loop.model_copy(update={"duration_s": step.seconds + 0.2, "shadow": False}),
+        "log": config.log.model_copy(update={"name": log_name}),
+        "stop": config.stop.model_copy(update={"ramp_rad_s2": None}),
+    }
+    return config.model_copy(update=changes)
