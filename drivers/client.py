@@ -52,10 +52,11 @@ from drivers.posix import (
     UNSENT,
     command,
     exchange,
+    follow,
 )
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
-from drivers.states import FAULT_RESET, translator
+from drivers.states import FAULT_RESET, codes_of, translator
 from drivers.stops import Outgoing, try_all
 from drivers.tables import incoming_tables, outgoing_tables
 from drivers.wire import FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
@@ -180,8 +181,10 @@ class DriveClient:
         self._sent_cells = [cell_of(tick, name) for name in SENT_FIELDS]
         if self._port is not None:
             incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
-            own = {"tick": raw, **incoming}
-            self._drain_socket = self._port.drainer(own, _offset(tick, "rx_flags"))
+            own = {"tick": raw, **incoming, "codes": codes_of(self.binding.map.states)}
+            self._drain_socket = self._port.drainer(
+                own, _offset(tick, "rx_flags"), _offset(tick, "drive_state")
+            )
             if self._sync is not None:
                 size = len(self._sync.view)
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
@@ -192,11 +195,11 @@ class DriveClient:
         self._tick = tick
 
     def compiled(self) -> Compiled | None:
-        """For the record that it is prepared for; None where exchange and command are not compiled."""
-        if self._exchange is None or self._command is None or self._port is None or self._sync is None:
+        """For the record that it is prepared for; None where receiving and command are not compiled."""
+        if self._port is None or self._command is None:
             return None
-        places = self._port.places
-        return Compiled(places[exchange], places[command], len(self._sync.view), self._log)
+        places, size = self._port.places, 0 if self._sync is None else len(self._sync.view)
+        return Compiled(places.get(exchange), places[follow], places[command], size, self._log)
 
     @property
     def command(self) -> Message:

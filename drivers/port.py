@@ -16,11 +16,13 @@ from drivers.posix import (
     DRAIN_MOST,
     FLAGS,
     FLAGS_AT,
-    LATE,
+    HEARD,
     MORE,
+    STATE_AT,
     command,
     drain,
     exchange,
+    follow,
 )
 from drivers.wire import STATE
 
@@ -38,10 +40,12 @@ class Saved(NamedTuple):
 class Compiled(NamedTuple):
     """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
 
-    ``exchange`` and ``command`` are places, ``sync_bytes`` the size of SYNC's frame, ``log`` the frames.
+    ``exchange``, ``follow`` and ``command`` are places, ``exchange`` None for a drive without SYNC;
+    ``sync_bytes``: size of SYNC's frame, ``log``: the frames.
     """
 
-    exchange: npt.NDArray[np.int64]
+    exchange: npt.NDArray[np.int64] | None
+    follow: npt.NDArray[np.int64]
     command: npt.NDArray[np.int64]
     sync_bytes: int
     log: npt.NDArray[np.void]
@@ -51,7 +55,7 @@ class SocketPort:
     """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
 
     def __init__(self, link: SocketLink, shared: Arrays) -> None:
-        io = np.zeros(LATE + 1, np.int64)
+        io = np.zeros(HEARD + 1, np.int64)
         self.io: Any = io.data
         self.places: dict[Any, npt.NDArray[np.int64]] = {}
         """What each kernel is called with."""
@@ -68,10 +72,11 @@ class SocketPort:
         self.places[kernel] = places_of(arrays, ARRAYS)
         return partial(compiled, self.places[kernel], *known)
 
-    def drainer(self, own: Arrays, flags_at: int) -> Callable[[int, bool], int]:
-        """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; the tick's flags' offset."""
-        self.io[FLAGS], self.io[MORE], self.io[FLAGS_AT] = 0, 0, flags_at
+    def drainer(self, own: Arrays, flags_at: int, state_at: int) -> Callable[[int, bool], int]:
+        """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; offsets in the tick."""
+        self.io[FLAGS], self.io[MORE], self.io[FLAGS_AT], self.io[STATE_AT] = 0, 0, flags_at, state_at
         made = self._over(drain, own, free=(0, False))
+        self.places[follow] = self.places[drain]
         self.restart()
         return made
 

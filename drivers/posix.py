@@ -19,7 +19,7 @@ from numba import types
 
 from drivers.frames import ENABLE_OPERATION, FRESH
 from drivers.jit import array_at, jit, waiting
-from drivers.states import FAULT_RESET
+from drivers.states import FAULT_RESET, state_of
 from drivers.wire import (
     DATA_AT,
     FRAME,
@@ -53,10 +53,16 @@ DONE, HANDED_BACK, PENDING = range(3)
 """What a kernel returns: it is done; the caller has a frame to judge or the log is full; frames wait."""
 REFUSED_COMMAND: Final = -1000
 """A value of the command fits no signal; other negative results are -errno."""
+WAITS, LEFT = -1, -2
+"""What :func:`follow` returns when it did nothing, or not all."""
+NO_WAIT_NS: Final = 1
+"""A deadline that has long passed: one feedback if it is there already."""
 UNSENT: Final = -2000
 """What -errno of a SYNC that was not sent is added to."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE = range(8)
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE, STATE_AT, HEARD = range(10)
+"""Of ``io``. STATE_AT: offset of the tick's drive_state; HEARD: feedback that :func:`follow` took before
+what it left to its caller."""
 DRAIN_MOST: Final = 256
 """Frames that are still read once the time has passed; a flood can't exceed it."""
 
@@ -64,11 +70,12 @@ ARRAYS: Final = {
     "fds": np.dtype("i4"), "times": np.dtype("i8"), "io": np.dtype("i8"), "raw": np.dtype("u1"),
     "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
     "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
-    "sync": np.dtype("u1"),
+    "sync": np.dtype("u1"), "codes": np.dtype("i8"),
 }  # fmt: skip
 """The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
 kernels here, the others of :mod:`drivers.wire`."""
-FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST, STATES, WORDS, TICK, LOG, FIELDS, SYNC = range(14)
+FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST = range(8)
+STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES = range(8, 15)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
 
 
@@ -137,6 +144,11 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
                 return size
             break
         seen = take(raw, messages, signals, last, state, words, tick, log, size, late, now_ns(times))
+        if seen >= STATE_RAW and io[STATE_AT] > 0:
+            cell = tick[io[STATE_AT] : io[STATE_AT] + 4].view(np.uint32)
+            raw_state: Any = np.int64(cell[0])
+            cell[0] = state_of(array_at(places, CODES, I8), raw_state, state[0]["controlword"])
+            seen ^= STATE_RAW
         if seen < 0 or seen >= STATE_RAW or state[0]["logged"] >= len(log) - 1 > 0:
             io[SEEN], io[SIZE] = seen, size
             return HANDED_BACK
@@ -191,6 +203,34 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     note(log, s, raw, 0, now_ns(times))
     code = transmit(fds, raw, size, state, log)
     return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
+
+
+@waiting
+def follow(places: Any, deadline_ns: int, most: int) -> Any:
+    """Wait for feedback until the deadline, then take what else is there; of several the newest counts.
+
+    Returns how many came, FRESH then in the tick's flags; WAITS where flags wait to be told or the bus was
+    down; LEFT where the caller must go on: what :func:`drain` returned is in ``IO`` at EXCHANGED, and how
+    many came before at HEARD.
+    """
+    s, io = array_at(places, STATES, STATE)[0], array_at(places, IO, I8)
+    if s["pending"] != 0 or s["down"] != 0:
+        return WAITS
+    at, tick = io[FLAGS_AT], array_at(places, TICK, U1)
+    flags = tick[at : at + 4].view(np.uint32)
+    heard, until_ns = 0, deadline_ns
+    while heard < most:
+        code = drain(places, until_ns, False)
+        if code != DONE:
+            io[EXCHANGED], io[HEARD] = code, heard
+            return LEFT
+        if flags[0] & np.uint32(FRESH) == 0:
+            break
+        heard, until_ns = heard + 1, NO_WAIT_NS
+        flags[0] &= np.uint32(0xFFFFFFFF - FRESH)
+    if heard > 0:
+        flags[0] |= np.uint32(FRESH)
+    return heard
 
 
 @jit

@@ -445,7 +445,7 @@ def compile_kernels(setup: Setup) -> None:
     setup.machine.looped()
     fac = setup.config.controller.kind == "fac"
     precompile(setup.database, setup.binding.map, fac, new_ticks()[0])
-    fused.load()
+    fused.load(plan_of(setup.config).pacing)
 
 
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:

@@ -26,21 +26,43 @@ from drivers.posix import (
     EINTR,
     EXCHANGED,
     IO,
+    LEFT,
     MONOTONIC,
     PENDING,
     STATES,
+    WAITS,
     clock_ns,
     command,
     exchange,
+    follow,
     now_ns,
 )
+from drivers.posix import HEARD as TAKEN
 from drivers.wire import STATE
 from hil.design import Machine
 from hil.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
 from hil.kernel import whole_at
 from hil.log.push import push
 from hil.log.recorder import Recorder
-from hil.loop import BEGUN, DECIDED, MAX_NS, NOT_BEGUN, RECORDED, SENT, Plan, Whole, none_compiled
+from hil.loop import (
+    ARRIVED,
+    BEGUN,
+    COUNTER_JUMP,
+    DECIDED,
+    HEARD,
+    MAX_NS,
+    NEVER,
+    NOT_BEGUN,
+    QUEUE_MOST,
+    RECORDED,
+    SENT,
+    STOP,
+    Pace,
+    Plan,
+    Whole,
+    missed,
+    none_compiled,
+)
 from hil.signals import ALL_MISSING, TICK
 from hil.trouble import TROUBLE
 
@@ -61,9 +83,9 @@ _clock_nanosleep = _types.ExternalFunction(
 THREAD_CPUTIME, ABSOLUTE = 3, 1
 I8: Final = np.dtype(np.int64)
 
-EXCHANGE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, ROWS = range(11)
+RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, ROWS = range(12)
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
-PERIOD_NS, TIMEOUT_NS, SYNC_BYTES = range(3)
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END = range(4)
 
 
 def whole_tick(
@@ -72,34 +94,38 @@ def whole_tick(
     machine: Machine,
     recorder: Recorder,
     plan: Plan,
+    pace: Pace,
     marks: Marks | None = None,
 ) -> Whole:
-    """The tick of a run on a socket that is paced by SYNC in real time; another is the loop's alone.
+    """The tick of a run on a socket, paced by SYNC or feedback in real time; another is the loop's alone.
 
-    The client must be prepared for the recorder's record, and for no other later.
+    The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
     """
     ports = client.compiled()
-    if ports is None or plan.pacing != "sync":
+    receive = None if ports is None else {"sync": ports.exchange, "feedback": ports.follow}.get(plan.pacing)
+    if ports is None or receive is None:
         return none_compiled
-    timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes])
+    end = NEVER if plan.ticks is None else plan.ticks
+    timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes, end])
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks = np.zeros(0, np.int64) if marks is None else marks
-    tables = [ports.exchange, ports.command, machine.places(), *recorder.places(ports.log)]
-    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks]
+    tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
+    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks, pace]
     rows = [place_of(table.reshape(-1), I8) for table in tables]
     rows += [place_of(array, TICK if array is recorder.record else I8) for array in arrays]
-    call = partial(_compiled(), np.array(rows))
+    call = partial(_compiled(run_tick if plan.pacing == "sync" else run_followed), np.array(rows))
     call.__dict__["alive"] = (client, machine, recorder, tables, arrays)  # the places are of them
     return call
 
 
-def _compiled() -> Callable[..., int]:
-    """The compiled form; the call that makes it is for a tick that is late, which it leaves alone."""
+def _compiled(kernel: Any) -> Callable[..., int]:
+    """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(3, np.int64)}
+    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(END + 1, np.int64)}
     for row, array in known.items():
         table[row] = place_of(array, I8)
-    return entry(run_tick, table, 0, 0, 0, False)
+    compiled: Callable[..., int] = entry(kernel, table, 0, 0, 0, False)
+    return compiled
 
 
 def new_marks() -> Marks:
@@ -107,10 +133,10 @@ def new_marks() -> Marks:
     return np.zeros(LAST + 1, np.int64)
 
 
-def load() -> None:
+def load(pacing: str) -> None:
     """Compile it, or load it."""
     if COMPILED:
-        _compiled()
+        _compiled(run_tick if pacing == "sync" else run_followed)
 
 
 @jit
@@ -161,7 +187,7 @@ def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_faile
 def read(table: Any, t: Any, deadline_ns: int) -> Any:
     """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
     words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
-    places, times = places_at(table, EXCHANGE), array_at(table, TIMES_AT, I8)
+    places, times = places_at(table, RECEIVE), array_at(table, TIMES_AT, I8)
     io = array_at(places, IO, I8)
     if len(words) > 0:
         words[BEAT_NS] = now_ns(times)
@@ -200,7 +226,7 @@ def answer(table: Any, t: Any) -> Any:
 @jit
 def hand_on(table: Any) -> None:
     """Frames into their ring, some ticks' together."""
-    state = array_at(places_at(table, EXCHANGE), STATES, STATE)
+    state = array_at(places_at(table, RECEIVE), STATES, STATE)
     if state[0]["logged"] >= FLUSH_AT:
         push(places_at(table, FRAMES_IN), state[0]["logged"])
         state[0]["logged"] = 0
@@ -224,6 +250,13 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
     mark(marks, READ, times)
     if stage < DECIDED:
         return stage
+    return conclude(table, ticks, deadline_ns, request)
+
+
+@jit
+def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
+    """Law, command and record of a tick whose feedback was waited for; ``request``: the last tick's."""
+    times, marks, t = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8), ticks[0]
     t["received_ns"] = since(deadline_ns, times)
     state = t["state"]
     whole_at(places_at(table, LAW), ticks)
@@ -241,3 +274,43 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
     t["recorded_ns"] = since(deadline_ns, times)
     mark(marks, RECORD, times)
     return RECORDED
+
+
+@jit
+def heard(table: Any, t: Any, k: int, deadline_ns: int, asked: int, count: int) -> Any:
+    """Stamp a tick that feedback woke, as :mod:`hil.loop` does; return its deadline, which may be later."""
+    plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
+    now, period_ns = now_ns(array_at(table, TIMES_AT, I8)), plan[PERIOD_NS]
+    late_ns = now - pace[ARRIVED] - period_ns
+    skipped = missed(count, int(t["rx_flags"] & np.uint32(COUNTER_JUMP)), late_ns, period_ns)
+    k, deadline_ns = k + skipped, deadline_ns + skipped * period_ns
+    expected_ns = pace[ARRIVED] + (1 + skipped) * period_ns
+    pace[ARRIVED] = now if count > 0 else expected_ns
+    t["k"], t["t_ns"], t["gap"], t["skipped"] = k, deadline_ns, 1 + skipped, skipped
+    t["lateness_ns"] = min(max(now - expected_ns, -MAX_NS), MAX_NS)
+    t["request"] = max(asked, STOP) if k >= plan[END] else asked
+    return deadline_ns
+
+
+@waiting
+def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
+    """:func:`run_tick` for a tick that begins when the drive's cyclic feedback comes."""
+    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
+    mark(marks, LOOP, times)
+    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
+    if k == 0 or (len(words) > 0 and words[FIRED] != 0):
+        return NOT_BEGUN
+    pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
+    t = ticks[0]
+    request = t["request"]
+    stamp(t, k, deadline_ns, deadline_ns, asked, log_failed)
+    count = follow(places, pace[ARRIVED] + plan[PERIOD_NS] * 3 // 2, QUEUE_MOST)
+    mark(marks, READ, times)
+    if count == WAITS:
+        return NOT_BEGUN
+    if count == LEFT:
+        pace[HEARD] = array_at(places, IO, I8)[TAKEN]
+        return BEGUN
+    if len(words) > 0:
+        t["rx_flags"] |= guardian_flags(words)
+    return conclude(table, ticks, heard(table, t, k, deadline_ns, asked, count), request)

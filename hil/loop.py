@@ -11,6 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+import numpy.typing as npt
+from numba.extending import register_jitable
+
 from hil.ports import Clock, Drive, Inbox, Recorder
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell, ticks_from
 from hil.trouble import TROUBLE, Trouble
@@ -20,6 +24,10 @@ Step = Callable[[TickArray], None]
 Whole = Callable[[int, int, int, bool], int]
 """A whole tick in one compiled call, as far as it goes: its number, deadline [ns], the request, whether the
 log failed; see :mod:`hil.fused`. It returns the stage that it reached."""
+Pace = npt.NDArray[np.int64]
+"""ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many a compiled tick has taken
+of a queue that it left to the loop."""
+ARRIVED, HEARD = range(2)
 NOT_BEGUN, BEGUN, DECIDED, SENT, RECORDED = range(5)
 """Stages of a tick: SYNC is not out; SYNC is out, the drive has feedback to conclude; the law has run; the
 command is out, where there is one; the record is stored. What is left is done here."""
@@ -83,12 +91,17 @@ class Outcome:
     """The first tick with a reason."""
 
 
+def new_pace() -> Pace:
+    """All zero."""
+    return np.zeros(HEARD + 1, np.int64)
+
+
 def none_compiled(_k: int, _deadline_ns: int, _asked: int, _log_failed: bool) -> int:
     """Every tick is left to the loop."""
     return NOT_BEGUN
 
 
-def no_whole() -> Whole:
+def no_whole(_pace: Pace) -> Whole:
     """No tick is compiled."""
     return none_compiled
 
@@ -99,6 +112,7 @@ def transition_event(state: int, reason: int) -> tuple[str, str]:
     return ("stop", f"{name}: {Reason(reason).name}") if reason else ("state", name)
 
 
+@register_jitable
 def missed(heard: int, jumped: int, late_ns: int, period_ns: int) -> int:
     """Periods that had no tick: those queued; where frames are missing, those that the clock counts.
 
@@ -129,8 +143,8 @@ class Loop:
 
     It is prepared when it is made: that sends nothing and takes longer than many ticks.
 
-    ``whole`` makes, for the prepared drive, the tick in which nothing is unusual; what that leaves is done by
-    the rules here, which are its own.
+    ``whole`` makes, for the prepared drive and the loop's pace, the tick in which nothing is unusual; what
+    that leaves is done by the rules here, which are its own.
     """
 
     def __init__(
@@ -142,7 +156,7 @@ class Loop:
         ticks: TickArray,
         plan: Plan,
         request: StopRequest,
-        whole: Callable[[], Whole] = no_whole,
+        whole: Callable[[Pace], Whole] = no_whole,
         inbox: Inbox | None = None,
     ) -> None:
         self._drive, self._clock, self._recorder = drive, clock, recorder
@@ -151,14 +165,16 @@ class Loop:
         self._sends_sync = plan.pacing == "sync"
         self._cells: Any = Cells(ticks)
         self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
-        self._arrived_ns = self._start_ns = 0
+        pace = new_pace()
+        self._pace: Any = pace.data
+        self._start_ns = 0
         self._inbox, self._taken = inbox, 0
         self._number: Any = inbox.number if inbox else [0]
         self._state = int(DriveState.SWITCH_ON_DISABLED)
         self._requested = int(Request.ARM)
         self._tick: Any = ticks[0]
         drive.prepare(self._tick)
-        self._whole = whole()
+        self._whole = whole(pace)
         self._ended = False  # True once the supervisor has left every state in which it drives
 
     def run(self) -> Outcome:
@@ -172,17 +188,26 @@ class Loop:
     def _run(self) -> None:
         outcome, period_ns, recorder = self._outcome, self._plan.period_ns, self._recorder
         tick, whole, compiled = self._tick, self._whole, self._whole is not none_compiled
+        follows = self._plan.pacing == "feedback"
         start_ns = self._start_ns = self._clock.now_ns()
         k = 0
         while True:
             deadline_ns = start_ns + k * period_ns
             stage = whole(k, deadline_ns, self._asked(k), recorder.failed) if compiled else NOT_BEGUN
+            if follows and stage > BEGUN:
+                k, deadline_ns = self._followed()
             if stage != RECORDED:
                 k = self._rest(stage, tick, k, deadline_ns)
             outcome.ticks += 1
             if self._ended:
                 return
             k += 1
+
+    def _followed(self) -> tuple[int, int]:
+        """k and deadline of a compiled tick that feedback woke: it may have skipped periods."""
+        t = self._cells
+        self._outcome.skipped += t.skipped[0]
+        return t.k[0], t.t_ns[0]
 
     def _asked(self, k: int) -> int:
         """What is asked of the supervisor; at the end of the run a stop, at least."""
@@ -234,7 +259,8 @@ class Loop:
         """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on."""
         now, t = self._clock.now_ns, self._cells
         self._stamp(k, deadline_ns, gap, now_ns)
-        t.rx_flags[0], t.missing[0] = 0, ALL_MISSING
+        if not self._pace[HEARD]:
+            t.rx_flags[0], t.missing[0] = 0, ALL_MISSING
         if self._sends_sync:
             self._exchange(tick, deadline_ns)
         elif self._plan.pacing == "timer":
@@ -283,36 +309,36 @@ class Loop:
         Each feedback is one period of the drive's clock, and so is each that is missing: k follows the time.
         Lateness is how much later it came than it was due. Returns k and its deadline.
         """
-        flags = self._cells.rx_flags
+        flags, pace = self._cells.rx_flags, self._pace
         plan, drive, fresh = self._plan, self._drive, int(RxFlag.FRESH)
         if not k:
-            self._arrived_ns = self._clock.now_ns()
-        wait_ns = plan.period_ns * 3 // 2
-        drive.receive(tick, self._clock.receive_deadline(self._arrived_ns, wait_ns))
-        heard = 0
+            pace[ARRIVED] = self._clock.now_ns()
+        heard, pace[HEARD] = pace[HEARD], 0
+        until_ns = self._clock.receive_deadline(pace[ARRIVED], plan.period_ns * 3 // 2)
+        drive.receive(tick, NO_WAIT if heard else until_ns)
         while flags[0] & fresh and heard < QUEUE_MOST:
             heard += 1
             flags[0] = flags[0] & ~fresh
             drive.receive(tick, NO_WAIT)
         now_ns = self._clock.now_ns()
-        late_ns = now_ns - self._arrived_ns - plan.period_ns
+        late_ns = now_ns - pace[ARRIVED] - plan.period_ns
         skipped = missed(heard, flags[0] & COUNTER_JUMP, late_ns, plan.period_ns) if k else 0
         if heard:
             flags[0] = flags[0] | fresh
         if skipped:
             k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
             self._outcome.skipped += skipped
-        expected_ns = self._arrived_ns + (1 + skipped) * plan.period_ns if k else now_ns
+        expected_ns = pace[ARRIVED] + (1 + skipped) * plan.period_ns if k else now_ns
         self._stamp(k, deadline_ns, 1 + skipped, now_ns + deadline_ns - expected_ns)
-        self._arrived_ns = now_ns if heard else expected_ns
+        pace[ARRIVED] = now_ns if heard else expected_ns
         return k, deadline_ns
 
     def _note_age(self, deadline_ns: int) -> None:
         """Paced by the timer: the newest feedback may be of an earlier tick, and ``received_ns`` says so."""
         t = self._cells
         if t.rx_flags[0] & int(RxFlag.FRESH):
-            self._arrived_ns = deadline_ns + t.received_ns[0]
-        t.received_ns[0] = max(self._arrived_ns - deadline_ns, -MAX_NS)
+            self._pace[ARRIVED] = deadline_ns + t.received_ns[0]
+        t.received_ns[0] = max(self._pace[ARRIVED] - deadline_ns, -MAX_NS)
 
     def _stamp(self, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         t = self._cells

@@ -38,9 +38,11 @@ from hil.loop import (
     RECORDED,
     SENT,
     Loop,
+    Pace,
     Plan,
     StopRequest,
     Whole,
+    new_pace,
     no_whole,
     none_compiled,
 )
@@ -79,15 +81,23 @@ class Drive(threading.Thread):
                 continue
             except OSError:
                 return
-            can_id, _, data = CLASSIC.unpack(raw)
-            self.heard.append(can_id)
-            if can_id == COMMAND:
-                self._echo, self._state = data[1] & 15, STATES.get(data[2] | data[3] << 8, self._state)
-            elif can_id == SYNC:
-                self.words.cells[GUARD_NS] = time.monotonic_ns()
-                with contextlib.suppress(OSError):  # the loop may have ended
-                    self._act(self, n)
+            if self.take(raw) == SYNC:
+                self.beat(n)
                 n += 1
+
+    def take(self, raw: bytes) -> int:
+        """What a frame of the loop's asks; returns its identifier."""
+        can_id, _, data = CLASSIC.unpack(raw)
+        self.heard.append(can_id)
+        if can_id == COMMAND:
+            self._echo, self._state = data[1] & 15, STATES.get(data[2] | data[3] << 8, self._state)
+        return int(can_id)
+
+    def beat(self, n: int) -> None:
+        """The guardian's sign of life, and the n-th answer."""
+        self.words.cells[GUARD_NS] = time.monotonic_ns()
+        with contextlib.suppress(OSError):  # the loop may have ended
+            self._act(self, n)
 
     def feedback(self, n: int) -> bytes:
         """Feedback on the n-th SYNC, with the next counter: never twice the same speed."""
@@ -106,6 +116,25 @@ class Drive(threading.Thread):
     def stop(self) -> None:
         self._over.set()
         self.join()
+
+
+class Cyclic(Drive):
+    """Sends by itself a period after each command: its clock and the loop's wait can't drift apart."""
+
+    def run(self) -> None:
+        n = 0
+        self.end.settimeout(0.2e-9 * PERIOD_NS)  # without a command the next comes before the loop gives up
+        while not self._over.is_set():
+            try:
+                time.sleep(PERIOD_NS * 1e-9)
+                self.beat(n)
+                while self.take(self.end.recv(128)) != COMMAND:
+                    pass
+            except TimeoutError:
+                pass
+            except OSError:
+                return
+            n += 1
 
 
 Act = Callable[[Drive, int], None]
@@ -210,6 +239,21 @@ def wrong_length(drive: Drive, n: int) -> None:
     calm(drive, n)
 
 
+@now_and_then(30, 45)
+def heap(drive: Drive, n: int) -> None:
+    """Three at once: the newest counts, the others are periods that had no tick."""
+    for _ in range(3):
+        drive.end.send(drive.feedback(n))
+
+
+@now_and_then(30)
+def emergency_behind(drive: Drive, n: int) -> None:
+    """A frame that the kernel hands back when it has taken feedback already, and more feedback behind it."""
+    drive.end.send(drive.feedback(n))
+    drive.end.send(pack_frame(EMERGENCY, bytes(8)))
+    drive.end.send(drive.feedback(n))
+
+
 @now_and_then(60)
 def gone(drive: Drive, n: int) -> None:
     drive.end.close()
@@ -268,15 +312,16 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
     stages: Counter[int] = Counter()
     words, machine = Words(), setup.machine.fresh()
     words.cells[GUARD_NS] = time.monotonic_ns()
-    plan = Plan(PERIOD_NS, TIMEOUT_NS, "sync", ticks)
+    pacing = setup.config.loop.pacing
+    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, ticks)
     recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
     recorder.await_open()
     failure = ""
     with ends() as (ours, theirs):
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
 
-        def counted() -> Whole:
-            made = fused.whole_tick(client, words, machine, recorder, plan)
+        def counted(pace: Pace) -> Whole:
+            made = fused.whole_tick(client, words, machine, recorder, plan, pace)
 
             def whole(*args: Any) -> int:
                 stage = made(*args)
@@ -288,7 +333,7 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
         guarded, record = GuardedDrive(client, words, time.monotonic_ns), recorder.record
         whole = counted if compiled else no_whole
         loop = Loop(guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole)
-        drive = Drive(setup, theirs, words, act)
+        drive = (Drive if pacing == "sync" else Cyclic)(setup, theirs, words, act)
         drive.start()
         try:
             outcome = loop.run()
@@ -372,6 +417,37 @@ def test_a_compiled_tick_is_the_loops_own(name: str, tmp_path: Path) -> None:
     assert not rules.stages
 
 
+FOLLOWED: dict[str, tuple[Act, set[int], str]] = {
+    # the same where the drive's own feedback wakes the loop; the first tick is the loop's
+    "calm": (calm, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "wrong crc": (wrong_crc, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "repeated counter": (repeated, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "jump of the counter": (jumped, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "no feedback": (silent, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "a heap": (heap, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "emergency that is over": (emergency, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
+    "emergency behind feedback": (emergency_behind, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
+    "emergency": (alarm, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
+    "strangers' frames": (strangers, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "second master": (second_master, {SENT, NOT_BEGUN, BEGUN}, "FOREIGN_COMMAND"),
+    "wrong length": (wrong_length, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "the other end is gone": (gone, {SENT, NOT_BEGUN, DECIDED}, "SEND_FAILED"),
+    "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+    "the guardian dies": (guardian_dies, {SENT, NOT_BEGUN}, "GUARDIAN_LOST"),
+}
+
+
+@pytest.mark.parametrize("name", FOLLOWED)
+def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, tmp_path: Path) -> None:
+    act, left, ended = FOLLOWED[name]
+    rules, compiled = both(setup_of('loop.pacing="feedback"'), tmp_path, act)
+    assert_same(rules, compiled)
+    assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
+    assert compiled.stages[NOT_BEGUN] == 1 or ended in ("SEND_FAILED", "GUARDIAN")
+    assert (BEGUN in compiled.stages) == (BEGUN in left)
+    assert compiled.ended == ended and not rules.stages
+
+
 @pytest.fixture
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A client, its compiled tick and the other end of the wire, without a loop."""
@@ -382,7 +458,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
         theirs.setblocking(False)
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
         client.prepare(recorder.record[0])
-        whole = fused.whole_tick(client, words, machine, recorder, plan)
+        whole = fused.whole_tick(client, words, machine, recorder, plan, new_pace())
         yield Parts(whole, words, recorder.record, theirs)
         recorder.close({})
 
@@ -448,10 +524,10 @@ def test_what_has_no_sync_or_no_socket_is_the_loops(tmp_path: Path, channel: str
     )
     other = open_link(BusSettings("virtual", channel))
     with ends() as (ours, _):
-        for link, pacing in ((SocketLink(None, ours, ours), "feedback"), (other, "sync")):
+        for link, pacing in ((SocketLink(None, ours, ours), "timer"), (other, "sync"), (other, "feedback")):
             client = DriveClient(link, setup.database)
             client.prepare(recorder.record[0])
             plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
-            assert fused.whole_tick(client, None, machine, recorder, plan) is none_compiled
+            assert fused.whole_tick(client, None, machine, recorder, plan, new_pace()) is none_compiled
     other.close()
     recorder.close({})

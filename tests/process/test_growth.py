@@ -16,7 +16,7 @@ from hil import fused
 from hil.app import Overrides, header_of, load_setup
 from hil.clock import LockstepClock, RealClock
 from hil.log.recorder import Recorder
-from hil.loop import NOT_BEGUN, Loop, Plan, StopRequest, Whole, none_compiled
+from hil.loop import NOT_BEGUN, Loop, Pace, Plan, StopRequest, Whole, none_compiled
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.process, pytest.mark.compiled]
@@ -56,8 +56,8 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str, compiled: bo
     plan, step = Plan(1_000_000, 800_000, "sync", TICKS), machine.looped()
     count = left = 0
 
-    def looked() -> Whole:
-        made = fused.whole_tick(client, None, machine, recorder, plan) if compiled else none_compiled
+    def looked(pace: Pace) -> Whole:
+        made = fused.whole_tick(client, None, machine, recorder, plan, pace) if compiled else none_compiled
 
         def whole(k: int, deadline_ns: int, asked: int, log_failed: bool) -> int:
             nonlocal count, left
