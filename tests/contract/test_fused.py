@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.bus import BusSettings, SocketLink, open_link
@@ -35,6 +36,7 @@ from hil.loop import (
     BEGUN,
     DECIDED,
     NOT_BEGUN,
+    RAMP_EVENT,
     RECORDED,
     SENT,
     Loop,
@@ -46,7 +48,7 @@ from hil.loop import (
     no_whole,
     none_compiled,
 )
-from hil.signals import FIELDS, Reason, TickArray
+from hil.signals import FIELDS, Reason, Request, TickArray
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.compiled, pytest.mark.process]
@@ -69,6 +71,7 @@ class Drive(threading.Thread):
         self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
         self._over = threading.Event()
         self.counter = self._echo = self._state = 0
+        self.operator = StopRequest()
         self.heard: list[int] = []
 
     def run(self) -> None:
@@ -334,6 +337,7 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
         whole = counted if compiled else no_whole
         loop = Loop(guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole)
         drive = (Drive if pacing == "sync" else Cyclic)(setup, theirs, words, act)
+        drive.operator = request
         drive.start()
         try:
             outcome = loop.run()
@@ -399,6 +403,24 @@ CASES: dict[str, tuple[Act, set[int], str]] = {
     "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
     "the guardian dies": (guardian_dies, {SENT}, "GUARDIAN_LOST"),
 }
+
+
+def test_the_ramp_of_a_stop_is_compiled(tmp_path: Path) -> None:
+    """Each tick of it is the compiled one, the events are the loop's."""
+
+    def act(drive: Drive, n: int) -> None:
+        if n == 40:  # before the answer that the loop waits for, so that it is the same tick in both
+            drive.operator.stop()
+        calm(drive, n)
+
+    setup = setup_of("reference.w_rad_s=2.0", "stop.ramp_rad_s2=8.0", "stop.ramp_max_s=50.0")
+    rules, compiled = both(setup, tmp_path, act)
+    assert_same(rules, compiled)
+    asked = compiled.log.ticks["request"] == Request.RAMP_DOWN
+    w_ref = compiled.log.ticks["w_ref"][asked]
+    assert w_ref[0] > 0 and w_ref[-1] == 0 and (np.diff(w_ref) <= 0).all() and asked.sum() > 20
+    assert [e["text"] for e in compiled.log.events].count(RAMP_EVENT[1]) == 1
+    assert compiled.stages[RECORDED] > asked.sum() and compiled.ended == "STOP_REQUESTED"
 
 
 LATE = ("late emergency", "second master between ticks")

@@ -143,8 +143,8 @@ def delays(count: int, seed: int, base: Path) -> list[Stop]:
 def verdict(done: list[Stop], count: int) -> tuple[bool, str]:
     """Whether all is as it should be, and the line that says what was found.
 
-    Without the right to lock memory or to FIFO the time is said, not judged; the drive's end always is. Of
-    fewer than a hundred kills the middle one is judged: their 99th percentile is the worst moment of the host.
+    Without the right to lock memory or to FIFO the time is said, not judged; the drive's end always is.
+    Of fewer than a hundred kills the middle one is judged: their 99th percentile is the host's worst moment.
     """
     if not done:
         return False, "first stop frame after SIGKILL: no run could be killed"
