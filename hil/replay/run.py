@@ -19,7 +19,7 @@ from hil.log.ticks import nothing
 from hil.replay.fold import broken, compare, earliest, refold
 from hil.replay.machine import Logged, logged_machine, restored
 from hil.replay.verdict import Difference, Verdict
-from hil.signals import FIELDS, TickArray
+from hil.signals import FIELDS, Reason, TickArray
 
 if TYPE_CHECKING:
     from hil.replay.frames import FrameCheck
@@ -153,7 +153,8 @@ def _run(replay: Replay, blocks: Iterable[tuple[str, Records]], seen: Callable[[
         if not more and (frames is None or frames.over(replay.difference)):
             break
     if frames is not None and not replay.why:
-        frames.finish()
+        if whole_end(replay.log):
+            frames.finish()
         if frames.difference is not None and complete_frames(replay.log):
             replay.difference = earliest(frames.difference, replay.difference)
     return replay.verdict()
@@ -169,6 +170,11 @@ def _frame_check(log: Log) -> FrameCheck:
 def complete_frames(log: Log) -> bool:
     """True where no frame was lost on the way into the log."""
     return log.damage is None and log.result.get("dropped_frames", 0) == 0 and "ended" in log.result
+
+
+def whole_end(log: Log) -> bool:
+    """True where the frames of the last ticks are there: a kill takes some along, a next part has some."""
+    return log.result.get("ended") in {reason.name.lower() for reason in Reason}
 
 
 def replay_log(log: Log) -> Verdict:

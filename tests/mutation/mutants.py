@@ -1,4 +1,4 @@
-"""Mutation testing of guard, supervisor and guardian: change one thing, count what their tests miss.
+"""Mutation testing of what keeps a run safe: change one thing, count what its tests miss.
 
     NUMBA_DISABLE_JIT=1 python -m tests.mutation.mutants [--sample 60 --seed 1]
 
@@ -41,6 +41,7 @@ JUDGES = {
     "hil/guard.py": SAFETY,
     "hil/supervisor.py": SAFETY,
     "hil/guardian.py": ("test_guardian.py",),
+    "hil/setpoint.py": ("test_setpoint.py",),
 }
 """The tests of tests/unit that judge the mutants of a file."""
 FILES = tuple(JUDGES)
