@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import canopen
-from canopen.objectdictionary import ODVariable, datatypes
+from canopen.objectdictionary import ODArray, ODVariable, datatypes
 
 from drivers.errors import DatabaseError
 from drivers.sdo import named
@@ -69,12 +69,13 @@ class Dictionary:
             raise DatabaseError(f"{self.path}: is the DCF of node {number}; drive.node_id is {node_id}")
 
     def find(self, place: Place) -> ODVariable | None:
-        """The object, None when it is not there."""
-        try:
-            found = self._objects[place.index]
-            return found if isinstance(found, ODVariable) and not place.sub else found[place.sub]
-        except (KeyError, TypeError):
-            return None
+        """The object, None when it is not there; the library makes up what an array does not list."""
+        found = self._objects.indices.get(place.index)
+        if found is None or isinstance(found, ODVariable):
+            return None if place.sub else found
+        listed = found.subindices
+        compact = isinstance(found, ODArray) and set(listed) == {0, 1} and place.sub
+        return found[place.sub] if place.sub in listed or compact else None
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Is the object there?"""

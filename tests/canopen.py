@@ -25,7 +25,6 @@ TABLE = """
 [canopen]
 eds = "drives/cia402.eds"
 mode = "cst"
-rpdo_timeout_ms = 20
 """
 EDS = CONFIGS / "drives" / "cia402.eds"
 
