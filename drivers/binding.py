@@ -91,6 +91,8 @@ class _Binder:
             emergency,
             heartbeat,
             self._factors,
+            self._message(self._map.nmt, "nmt"),
+            self._database.node.node_id,
         )
         names = Names(self._received, self._sent, tuple(self._all_sent()), self._counters)
         for mistake in (*mistakes_of_map(self._map, names), *mistakes_of_frames(made, self._database.node)):

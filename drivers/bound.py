@@ -54,6 +54,8 @@ class Binding:
     heartbeat: Message | None
     factors: Mapping[str, float] = field(default_factory=dict)
     """From the DBC's unit of each part to SI, where they differ."""
+    nmt: Message | None = None
+    node_id: int = 1
 
     def signal(self, part: str) -> Signal | None:
         """The signal of a part, in SI units; None when the drive has none."""

@@ -57,13 +57,16 @@ from drivers.posix import (
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import FAULT_RESET, codes_of, translator
-from drivers.stops import Outgoing, try_all
+from drivers.stops import STOP_PAUSE_S, Outgoing, try_all
 from drivers.tables import incoming_tables, outgoing_tables
-from drivers.wire import FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
+from drivers.wire import DATA_AT, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
 STOP_REPEATS: Final = 5
+START: Final = 0x01
+PRE_OPERATIONAL: Final = 0x80
+"""NMT commands of CiA 301."""
 DOWN: Final = "the bus was down; nothing more is sent"
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
@@ -151,6 +154,7 @@ class DriveClient:
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
         self._stops = [self._stop_frames(out) for out in self._outgoing]
+        self._started, self._left = (self._nmt_frame(command) for command in (START, PRE_OPERATIONAL))
 
     def _stop_frames(self, out: Outgoing) -> list[Outgoing]:
         """The stop frames of one message, ready to be sent, by the command's counter. Raises EncodeError."""
@@ -165,6 +169,17 @@ class DriveClient:
             frame.encode = partial(noting, self._log, self._state, frame.raw)
             frames.append(frame)
         return frames
+
+    def _nmt_frame(self, command: int) -> Outgoing | None:
+        """An NMT command to the drive's node, ready to be sent; None where no NMT is mapped."""
+        message = self.binding.nmt
+        if message is None:
+            return None
+        frame = Outgoing(message, 0)
+        frame.view[DATA_AT : DATA_AT + 2] = bytes((command, self.binding.node_id))
+        noting = (self._log, self._state, frame.raw)
+        frame.encode = partial(entry(note_sent, *noting, 0), *noting)
+        return frame
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -426,13 +441,27 @@ class DriveClient:
             self._cells[_LOGGED] = 0
             self._on_frames(self._log_bytes[: count * FRAME.itemsize])
 
+    def start(self) -> None:
+        """Start the drive's node (NMT), so that its PDOs go; after arming. Raises LinkError."""
+        if self._started is not None:
+            self._stop_with(self._started)
+
+    def leave(self) -> None:
+        """Put the drive's node back to pre-operational; never raises. A full queue is tried again."""
+        for _ in range(STOP_REPEATS if self._left is not None else 0):
+            with contextlib.suppress(Exception):  # a bus that is down takes nothing at all
+                assert self._left is not None  # noqa: S101 - or there was no round
+                return self._stop_with(self._left)
+            time.sleep(STOP_PAUSE_S)
+        return None
+
     def stop_from(self, counter: int) -> None:
         """:meth:`stop` with counters after ``counter``: for another process than the one that sent."""
         self._cells[_LAST_SENT] = counter
         self.stop()
 
     def stop(self) -> None:
-        """Zero voltage and disable, a few times with advancing counters and SYNC; never raises.
+        """Zero voltage and disable, a few times with advancing counters and SYNC, then NMT; never raises.
 
         The frames are ready since before anything was armed: nothing that can be wrong with a command keeps
         one of them from being sent, and one that can't be sent keeps not the others.
@@ -442,6 +471,7 @@ class DriveClient:
             counter = (counter + 1) % self.binding.counter_modulus
             try_all([*(partial(self._stop_with, frames[counter]) for frames in self._stops), self._send_sync])
             self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, 0
+        self.leave()
         with contextlib.suppress(Exception):  # the log is not what matters now
             self.flush()
 

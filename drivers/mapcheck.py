@@ -107,6 +107,8 @@ def mistakes_of_frames(made: Binding, node: NodeRule) -> Iterator[str]:
     signals = {bound.message.name: bound.message for bound in made.incoming + made.outgoing}
     sent = {bound.message.name for bound in made.outgoing}
     messages = dict(signals)
+    if made.nmt is not None and (made.nmt.send_id, made.nmt.length) != (0x000, 2):
+        yield f"nmt: {made.nmt.name} is not CANopen's: identifier 0x000, 2 bytes"
     for part in ("sync", "emergency", "heartbeat"):
         message: Message | None = getattr(made, part)
         if message is None:

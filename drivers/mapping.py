@@ -67,7 +67,8 @@ MEASURED: Final = ("speed", "i_q", "i_d")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveMap:
-    """A drive's parts as ``MESSAGE.Signal``; ``sync``, ``emergency`` and ``heartbeat`` name messages.
+    """A drive's parts as ``MESSAGE.Signal``; ``sync``, ``emergency``, ``heartbeat`` and ``nmt`` name
+    messages.
 
     An empty part is not there. ``counters``: the frame counter of each message that has one. ``constants``:
     signals that are always sent with a value. ``units``: the unit of a part (or ``MESSAGE.Signal``) for which
@@ -119,6 +120,8 @@ class DriveMap:
     """Emergency message of the drive."""
     heartbeat: str = ""
     """Heartbeat of the drive."""
+    nmt: str = ""
+    """CANopen's NMT message: the drive's node is started after arming, and every stop leaves operation."""
     counters: tuple[str, ...] = ()
     """Frame counters, one for each message that has one."""
     constants: Mapping[str, int | float] = field(default_factory=dict)

@@ -32,6 +32,7 @@ from hil.claim import ClaimedError, claimed
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
 from hil.design import Machine, SlowMessage, WireFacts, build
+from hil.errorcodes import words
 from hil.errors import ArmingError, ConfigError, HilError
 from hil.guardian import GuardedDrive, Rights, Words, guardian
 from hil.inbox import Inbox, ranges
@@ -535,11 +536,24 @@ def _recorded(
         alone = watch is not None or clock.name != "monotonic"
         whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
         takes = set_by_others(setup)
-        with contextlib.closing(Inbox(machine, takes)) as inbox:
+        with contextlib.closing(Inbox(machine, takes)) as inbox, _started(None if watch else client):
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None)
             client.discard()
             return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length)
+
+
+@contextlib.contextmanager
+def _started(client: DriveClient | None) -> Iterator[None]:
+    """The drive's CANopen node in operation, where it has one; every way out leaves it. None: a shadow."""
+    if client is None:
+        yield
+        return
+    client.start()
+    try:
+        yield
+    finally:
+        client.leave()
 
 
 def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
@@ -631,6 +645,8 @@ def _run_armed(
         end = None if stop is None else explain(machine.safety, machine.safety_state, stop[0])
         if end is not None:
             result["end"] = end.as_dict()
+        if stop is not None and (code := int(stop[0]["drive_error"])):
+            recorder.event(clock.now_ns(), int(stop[0]["k"]), "drive-error", words(code))
         complete = recorder.close(result)
         if not complete:
             kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"

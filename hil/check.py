@@ -18,6 +18,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
+from hil.errorcodes import words
 from hil.errors import HilError, plain
 from hil.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
@@ -269,18 +270,18 @@ def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> R
     remedy = "clear the drive's fault and its cause first"
     if "state" in values:
         state, error = DriveState(int(values["state"])), int(values.get("error", 0))
-        found = state.name.lower().replace("_", " ") + (f", error 0x{error:04X}" if error else "")
+        found = state.name.lower().replace("_", " ") + (f", error {words(error)}" if error else "")
         if state == DriveState.OPERATION_ENABLED:
             return Row("drive state", "warn", found, "somebody has enabled it; disable it before arming")
         return row("drive state", state not in FAULTS and not error, found, remedy)
     if code := _emergency(traffic, binding):
-        return Row("drive state", "fail", f"error 0x{code:04X} by its emergency message", remedy)
+        return Row("drive state", "fail", f"error {words(code)} by its emergency message", remedy)
     beat = _nmt_state(traffic, binding)
     if beat is None:
         return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
     nmt = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"
     if values.get("error"):
-        return Row("drive state", "fail", f"{nmt}, error 0x{int(values['error']):04X}", remedy)
+        return Row("drive state", "fail", f"{nmt}, error {words(int(values['error']))}", remedy)
     if beat != OPERATIONAL:
         return Row("drive state", "warn", f"its node is {nmt}", "set the drive operational (NMT start)")
     found = f"unknown before SYNC: its node is {nmt}, and is that with a drive in FAULT, too"

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
+from hil.errorcodes import words
 from hil.signals import DriveState, GuardFlag, Reason
 
 ASKED: Final = (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED)
@@ -117,7 +118,7 @@ def _never_came(p: Any, s: Any, t: Any) -> str:
 def _drive(p: Any, s: Any, t: Any) -> str:
     state = int(t["drive_state"])
     name = DriveState(state).name if state in tuple(DriveState) else str(state)
-    return f"it is in {name}, error 0x{int(t['drive_error']):04X}"
+    return f"it is in {name}, error {words(int(t['drive_error']))}"
 
 
 _TEMPERATURES: Final = ("temperature_motor", "temperature_inverter")

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ import numpy as np
 import pytest
 
 from drivers import frames
+from drivers.binding import bind
 from drivers.bus import BusSettings, Frame, Link, open_link
 from drivers.client import STOP_REPEATS, DriveClient
 from drivers.codec import Database
-from drivers.errors import EncodeError, LinkDown, LinkError, QueueFull
+from drivers.errors import DatabaseError, EncodeError, LinkDown, LinkError, QueueFull
 from drivers.local import EFF_FLAG, ERR_FLAG, RTR_FLAG
+from drivers.mapping import DriveMap, house_map
 from drivers.wire import FRAME
 from hil.signals import RxFlag, new_ticks
 from tests.conftest import CONFIGS
@@ -443,3 +446,60 @@ def test_fd_drive(channel: str) -> None:
     assert (values["Counter"], values["LoadEnable"]) == (200, 1)
     assert (values["LoadTorque"], values["VoltageQ"]) == pytest.approx((1.25, -1e-6))
     bench.close()
+
+
+NMT = '\nBO_ 0 NMT: 2 Controller\n SG_ Command : 0|8@1+ (1,0) [0|255] "" Drive\n'
+
+
+def with_nmt(path: Path, node_id: int, more: str = NMT) -> tuple[Database, DriveMap]:
+    """The house protocol of a node that NMT starts and stops."""
+    database = Database(path, node_id, text=HOUSE.read_text(encoding="utf-8") + more)
+    return database, replace(house_map(database), nmt="NMT")
+
+
+@pytest.mark.parametrize("node_id", [1, 5])
+def test_nmt_starts_the_node_and_every_stop_leaves_operation(channel: str, node_id: int) -> None:
+    """CiA 301: command and node number; nothing before start, 80h last of all in a stop."""
+    database, drive_map = with_nmt(HOUSE, node_id)
+    peer = open_link(BusSettings("hil-local", channel))
+    client = DriveClient(open_link(BusSettings("hil-local", channel)), database, drive_map=drive_map)
+    try:
+        assert peer.receive(20_000_000) is None
+        client.start()
+        client.stop()
+        sent = [(frame.can_id, frame.data) for frame in iter(lambda: peer.receive(20_000_000), None)]
+    finally:
+        client.close()
+        peer.close()
+    assert sent[0] == (0x000, bytes((0x01, node_id))) and sent[-1] == (0x000, bytes((0x80, node_id)))
+    assert [data for can_id, data in sent if can_id == 0] == [sent[0][1], sent[-1][1]]
+    assert 0x200 + node_id in {can_id for can_id, _ in sent}
+
+
+def test_another_process_stops_the_node_too(channel: str) -> None:
+    """The guardian stops with a client of its own, which has started nothing."""
+    database, drive_map = with_nmt(HOUSE, 5)
+    peer = open_link(BusSettings("hil-local", channel))
+    client = DriveClient(open_link(BusSettings("hil-local", channel)), database, drive_map=drive_map)
+    client.stop_from(3)
+    sent = [(frame.can_id, frame.data) for frame in iter(lambda: peer.receive(20_000_000), None)]
+    client.close()
+    peer.close()
+    assert [one for one in sent if one[0] == 0] == [sent[-1]] == [(0x000, b"\x80\x05")]
+
+
+@pytest.mark.parametrize("more", [NMT.replace("2 Contr", "3 Contr"), NMT.replace("BO_ 0", "BO_ 1")])
+def test_an_nmt_that_is_none(more: str) -> None:
+    database, drive_map = with_nmt(HOUSE, 1, more)
+    with pytest.raises(DatabaseError, match=r"nmt: NMT is not CANopen's: identifier 0x000, 2 bytes"):
+        bind(drive_map, database)
+
+
+def test_a_bus_that_is_down_takes_no_nmt_and_no_exception_comes(channel: str) -> None:
+    database, drive_map = with_nmt(HOUSE, 5)
+    client = DriveClient(open_link(BusSettings("hil-local", channel)), database, drive_map=drive_map)
+    client.close()
+    client.stop()
+    client.leave()
+    with pytest.raises(LinkError):
+        client.start()
