@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -90,11 +91,29 @@ class Law:
     keys: Mapping[str, Key] = field(default_factory=dict)
 
 
+_REGISTERED: Final[list[Any]] = []
+"""What :func:`register` took."""
+
+
+def register(member: Observer | Law) -> None:
+    """Add a member in this process alone, before anything reads a configuration.
+
+    For a notebook or a trial; what is to run in the emulator's process, in workers and in a later replay
+    is a package with an entry point. Raises ControlDesignError once the tables of the kinds are made.
+    """
+    if "hil.config" in sys.modules:
+        raise ControlDesignError(f"kind {member.kind!r}: register it before the first configuration is read")
+    _REGISTERED.append(member)
+    observers.cache_clear()
+    laws.cache_clear()
+
+
 def _found(group: str, kind: Any) -> dict[str, Any]:
     """Members by kind: those of the folder in the order of their names, then those of other packages."""
     names = sorted(p.stem for p in Path(__file__).with_name(group).glob("*.py") if p.stem != "__init__")
     members = [importlib.import_module(f"hil.control.{group}.{name}").MEMBER for name in names]
     members += [entry.load() for entry in entry_points(group=f"hil.{group}")]
+    members += [member for member in _REGISTERED if isinstance(member, kind)]
     found: dict[str, Any] = {}
     for member in members:
         if not isinstance(member, kind) or member.kind in found:

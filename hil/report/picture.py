@@ -22,14 +22,21 @@ DPI: Final = 100
 
 
 def picture(runs: Sequence[Run]) -> bytes:
-    """PNG bytes; two columns of plots."""
+    """PNG bytes of :func:`figure`."""
+    out = io.BytesIO()
+    figure(runs).savefig(out, format="png")
+    return out.getvalue()
+
+
+def figure(runs: Sequence[Run]) -> Figure:
+    """The picture itself; two columns of plots."""
     plots = [plot for plot in PLOTS if not is_empty(runs, plot)]
     rows = max(1, -(-len(plots) // 2))
     with matplotlib.rc_context({"font.size": 8, "axes.grid": True, "grid.color": "#d8dde3"}):
-        figure = Figure(figsize=(INCHES[0], INCHES[1] * rows + 0.6), dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        figure.suptitle("\n".join(map(_headline, runs)), fontsize=10, parse_math=False)
-        axes = figure.subplots(rows, 2, squeeze=False, sharex=True).ravel()
+        drawn = Figure(figsize=(INCHES[0], INCHES[1] * rows + 0.6), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(drawn)
+        drawn.suptitle("\n".join(map(_headline, runs)), fontsize=10, parse_math=False)
+        axes = drawn.subplots(rows, 2, squeeze=False, sharex=True).ravel()
         for axis in axes[len(plots) :]:
             axis.set_visible(False)
         for axis, plot in zip(axes, plots, strict=False):
@@ -37,9 +44,7 @@ def picture(runs: Sequence[Run]) -> bytes:
         for axis in axes[len(plots) - 2 : len(plots)]:  # the last of each column
             axis.tick_params(labelbottom=True)
             axis.set_xlabel("t [s]", fontsize=7)
-        out = io.BytesIO()
-        figure.savefig(out, format="png")
-    return out.getvalue()
+    return drawn
 
 
 def _headline(run: Run) -> str:
