@@ -44,7 +44,15 @@ UNITS: Final = {
 }
 """Ends of names, each before those that it ends in itself."""
 
-COUNTS: Final = ("skipped_max", "dropped_max", "lost_feedback_max", "crc_errors_max", "samples", "bits")
+COUNTS: Final = (
+    "skipped_max",
+    "dropped_max",
+    "lost_feedback_max",
+    "crc_errors_max",
+    "samples",
+    "bits",
+    "passes",
+)
 NUMBERS: Final = ("n_p", "fifo_priority", "cpu", "node_id", "seed", "damping", "share")
 PURE: Final = frozenset((*COUNTS, *NUMBERS, "covariance", "mean"))
 """What has no unit of its own: counts, numbers of things, ratios, and what has those of other keys."""

@@ -19,8 +19,8 @@ CODE = 3
 _TABLES = {"q": "row_q", "d": "row_d", "w_rad_s": "row_w", "slew_a_s": "row_slew", "for_s": "row_ticks"}
 
 
-def _numbers(doc: str, least: float | None = None) -> Key:
-    return Key(doc, type="numbers", above=None, least=least, count=ROWS)
+def _numbers(doc: str, least: float | None = None, unit: str = "") -> Key:
+    return Key(doc, type="numbers", above=None, least=least, count=ROWS, unit=unit)
 
 
 def design(values: Values, plan: Plan) -> dict[str, Any]:
@@ -48,8 +48,8 @@ MEMBER = Law(
     CODE,
     design,
     {
-        "q": _numbers("q voltage in units of the level, or q current [A]"),
-        "d": _numbers("d voltage in units of the level"),
+        "q": _numbers("q voltage in units of the level, or q current", unit="levels or A"),
+        "d": _numbers("d voltage in units of the level", unit="levels"),
         "w_rad_s": _numbers("speed at which the row ends"),
         "slew_a_s": _numbers("how fast the current goes there", 0.0),
         "for_s": _numbers("longest time of the row", 0.0),

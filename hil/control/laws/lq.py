@@ -52,9 +52,9 @@ MEMBER = Law(
     0,
     design,
     {
-        "speed_weight": Key("weight of the speed error squared, per V^2 of u_q"),
+        "speed_weight": Key("weight of the speed error squared; that of u_q^2 is 1", unit="V^2 s^2/rad^2"),
         "current_weight": Key(
-            "weight of the current error squared, per V^2 of u_q", 1e-3, above=None, least=0.0
+            "weight of the current error squared", 1e-3, above=None, least=0.0, unit="V^2/A^2"
         ),
     },
 )

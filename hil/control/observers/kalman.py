@@ -53,8 +53,8 @@ MEMBER = Observer(
     "kalman",
     "steady-state Kalman filter, d a random walk",
     {
-        "d_walk_per_s": Key("random walk of d: standard deviation a tick / T_s [rad/s3 or A/s2]"),
-        "x_noise": Key("noise of the measured state, resolution included [rad/s or A]"),
+        "d_walk_per_s": Key("random walk of d: standard deviation a tick / T_s", unit="rad/s^3 or A/s^2"),
+        "x_noise": Key("noise of the measured state, resolution included", unit="rad/s or A"),
         "filtered_state": Key("the law takes x_hat (the speed table says it)", False, "flag"),
     },
     joint=joint,
