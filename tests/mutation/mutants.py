@@ -41,7 +41,6 @@ JUDGES = {
     "hil/guard.py": SAFETY,
     "hil/supervisor.py": SAFETY,
     "hil/guardian.py": ("test_guardian.py",),
-    "hil/setpoint.py": ("test_setpoint.py",),
 }
 """The tests of tests/unit that judge the mutants of a file."""
 FILES = tuple(JUDGES)
