@@ -10,7 +10,7 @@ NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.2
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
 COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
 
-.PHONY: golden reference gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
+.PHONY: docs golden reference gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
 
 help: ## show what there is
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -55,6 +55,10 @@ gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
 
 reference: $(STAMP) ## make docs/reference-config.md and the files' schemas anew
 	$(BIN)/python -m hil.manual.page docs
+
+docs: $(STAMP) ## the documentation as a site in .cache/site, links checked
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo ".cache/site/index.html"
 
 golden: $(STAMP) ## run the golden scenarios: what changed against the kept logs (KEEP=name, SIGN="reason")
 	$(BIN)/python -m tests.golden.rewrite $(if $(KEEP),--keep '$(KEEP)') $(if $(SIGN),--sign '$(SIGN)')

@@ -31,7 +31,7 @@ def metrics(log: Log | File) -> dict[str, float | None]:
 def plot(*logs: Log | File, path: File | None = None) -> Figure:
     """The curves of one run, or of several side by side, as a matplotlib figure; saved as well with ``path``.
 
-    Raises :class:`hil.HilError` for what is no log.
+    Raises ``hil.HilError`` for what is no log.
     """
     from hil.report.picture import figure
 
@@ -44,7 +44,7 @@ def plot(*logs: Log | File, path: File | None = None) -> Figure:
 def report(*logs: File, path: File) -> Report:
     """Write the report of one or several log files, an HTML page or a PNG by the name's end.
 
-    The result says ``passed`` and, as ``as_dict()``, all that the page shows. Raises :class:`hil.HilError`.
+    The result says ``passed`` and, as ``as_dict()``, all that the page shows. Raises ``hil.HilError``.
     """
     return build_report([Path(log) for log in logs], Path(path))
 

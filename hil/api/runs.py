@@ -32,8 +32,8 @@ def simulate(
     """Controller and emulated motor in one process, without a bus, as fast as the machine goes.
 
     ``plant`` sets keys of the emulated drive. The result has the ticks (``ticks``, ``to_pandas()``), how it
-    ended (``result``) and what :func:`hil.metrics`, :func:`hil.plot` and :func:`hil.replay` need; it is a
-    file only with ``log``. Raises :class:`hil.HilError` for what can't be simulated.
+    ended (``result``) and what ``hil.metrics``, ``hil.plot`` and ``hil.replay`` need; it is a
+    file only with ``log``. Raises ``hil.HilError`` for what can't be simulated.
     """
     setup = setup_of(config, settings)
     if log:
@@ -65,7 +65,7 @@ def run(config: Setup | File, settings: Settings = (), *, arm: bool = False, emu
 
     ``emulated``: beside an emulated drive of its own, on a channel that nobody else has. ``arm`` allows
     voltage on a bus that may be real, and asks nothing more: it is ``--arm --yes`` of ``hil run``.
-    Returns the log as it was written. Raises :class:`hil.HilError` before anything is sent.
+    Returns the log as it was written. Raises ``hil.HilError`` before anything is sent.
     """
     setup = setup_of(config, settings)
     if not emulated:
@@ -86,7 +86,7 @@ def _apart(setup: Setup) -> Setup:
 def emulator(config: Setup | File, settings: Settings = (), *, plant: Settings = ()) -> Iterator[int]:
     """The emulated drive of a configuration as a process of its own, while the block lasts; yields its pid.
 
-    Raises :class:`hil.HilError` when it can't start.
+    Raises ``hil.HilError`` when it can't start.
     """
     setup = setup_of(config, settings)
     with emulator_process(setup.path, overrides(_differing(setup)), texts(plant)) as pid:
@@ -103,6 +103,6 @@ def replay(log: Log | File) -> Verdict:
     """Re-run the controller over a log and compare every output by bits.
 
     The verdict's ``verdict`` is ``same``, ``differs`` (with the first difference) or ``cannot`` (with
-    ``why``). Raises :class:`hil.HilError` for what is no log.
+    ``why``). Raises ``hil.HilError`` for what is no log.
     """
     return replay_log(log if isinstance(log, Log) else open_log(str(log)))

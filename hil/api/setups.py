@@ -35,7 +35,7 @@ def load(config: File, settings: Settings = ()) -> Setup:
     ``config`` is the path of the file, ``settings`` are other values of its keys. Of the result are public:
     ``config`` (typed, frozen tables: ``config.loop.rate_hz``), ``path`` and ``warnings``.
 
-    Raises :class:`hil.ConfigError` that names every mistake, and other :class:`hil.HilError`.
+    Raises ``hil.ConfigError`` that names every mistake, and other ``hil.HilError``.
     """
     return load_setup(Path(config), overrides(settings))
 
@@ -44,7 +44,7 @@ def build(tables: Mapping[str, Any], path: File) -> Setup:
     """A configuration from tables, ``{"loop": {"rate_hz": 1000}, ...}``, written to ``path`` and loaded.
 
     Paths in the tables are relative to that file. It is what ``hil emulate`` and a log need, and is written
-    over only where ``build`` made it. Raises :class:`hil.HilError` for a file of another origin.
+    over only where ``build`` made it. Raises ``hil.HilError`` for a file of another origin.
     """
     file = Path(path)
     if file.exists() and not file.read_text(encoding="utf-8", errors="replace").startswith(BUILT):

@@ -34,8 +34,8 @@ def design(
 
     ``wish``: ``u_noise_mv``, ``ms``, ``ms_worst``, ``dip`` [rad/s], ``recovery_ms``, ``laws``, ``effort`` and
     those of a shaft. ``load`` [N m], ``w_noise`` [rad/s], ``i_noise`` [A] default to those of the plant.
-    Of the result: ``settings`` for :func:`hil.load`, the same as ``toml``, ``front``, what it will do.
-    Raises :class:`hil.HilError` when no design keeps the limits.
+    Of the result: ``settings`` for ``hil.load``, the same as ``toml``, ``front``, what it will do.
+    Raises ``hil.HilError`` when no design keeps the limits.
     """
     asked = designing.Wish(**_known(wish, designing.Wish))
     shares = dict(spread) if isinstance(spread, Mapping) else dict.fromkeys(SPREAD, float(spread))
@@ -50,7 +50,7 @@ def compare(
     """Laws, each tuned by one optimiser to the same limits and run on the same plants, as ``hil compare``.
 
     ``wish``: ``u_noise_mv``, ``ms``, ``ms_worst``, ``spread``, ``seeds``, ``effort``. Raises
-    :class:`hil.HilError`.
+    ``hil.HilError``.
     """
     families = comparing.parse_laws(",".join(laws))
     asked = comparing.Wish(**_known(wish, comparing.Wish))
@@ -67,7 +67,7 @@ def sweep(
     """Simulate every combination of ``axes``, ``{"controller.speed_pole_rad_s": [40.0, 80.0]}``.
 
     A key of the emulated drive begins with ``plant:``; a value may be a whole table. A dict for each case:
-    ``case``, ``ended``, dip, recovery and so on. Raises :class:`hil.HilError`.
+    ``case``, ``ended``, dip, recovery and so on. Raises ``hil.HilError``.
     """
     own = [f"{key}={inline(list(v))}" for key, v in axes.items() if not key.startswith(PLANT)]
     plants = [f"{k.removeprefix(PLANT)}={inline(list(v))}" for k, v in axes.items() if k.startswith(PLANT)]

@@ -82,7 +82,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A law: ``code`` selects its kernel in :func:`hil.control.law.command`; ``design`` yields parameters."""
+    """A law: ``code`` selects its kernel in ``hil.control.law.command``; ``design`` yields parameters."""
 
     kind: str
     doc: str
@@ -92,7 +92,7 @@ class Law:
 
 
 _REGISTERED: Final[list[Any]] = []
-"""What :func:`register` took."""
+"""What ``register`` took."""
 
 
 def register(member: Observer | Law) -> None:
