@@ -17,10 +17,10 @@ from drivers.mapcheck import (
     mistakes_of_values,
     plain_states,
 )
-from drivers.mapping import MEASURED, RECEIVED, SENT, DriveMap, Part
+from drivers.mapping import COMMANDED_Q, MEASURED, RECEIVED, SENT, DriveMap, Part
 from drivers.payload import NO_PAYLOAD, Layout
 from drivers.signal import Signal
-from drivers.units import FIRST, shown, unit_of
+from drivers.units import DRIVE_TORQUE, FIRST, shown, unit_of
 
 __all__ = ["MOST_COUNTS", "Binding", "Bound", "bind"]
 
@@ -73,11 +73,15 @@ class _Binder:
         named = {part: getattr(self._map, part) for part in parts if part not in skipped}
         return {part: pair for part, text in named.items() if text for pair in self._pairs(part, (text,))}
 
+    def _lead(self) -> str:
+        """The message with the command; empty for none."""
+        return next((self._sent[part][0] for part in COMMANDED_Q if part in self._sent), "")
+
     def bind(self) -> Binding:
         """Return the binding or raise with all mistakes."""
         incoming = self._incoming()
         outgoing = self._outgoing()
-        last = self._sent.get("u_q", ("", ""))[0]
+        last = self._lead()
         outgoing.sort(key=lambda bound: bound.message.name == last)
         sync, emergency, heartbeat = (
             self._message(getattr(self._map, name), name) for name in ("sync", "emergency", "heartbeat")
@@ -217,6 +221,8 @@ class _Binder:
         if not rule.units:
             return self._checked_plain(part, signal, where)
         factor = self._factor(part, rule.units, signal, where)
+        if part == "torque":
+            return signal.in_unit("A", factor / (self._map.k_t or 1.0))
         if factor != 1.0:
             self._factors[part] = factor
         return signal if factor == 1.0 else signal.in_unit(FIRST[id(rule.units)], factor)
@@ -232,11 +238,22 @@ class _Binder:
                 f"{part}: {where} {has}; give it one of {shown(units)} in the DBC or in drive.signals.units"
             )
             return 1.0
+        if unit.rated:
+            return unit.factor * self._rated(part, units, where)
         if not unit.electrical:
             return unit.factor
         if not self._map.pole_pairs:
             self._add(f"{part}: {where} counts electrical turns; that needs the motor's pole pairs")
         return unit.factor / (self._map.pole_pairs or 1)
+
+    def _rated(self, part: str, units: Mapping[str, float], where: str) -> float:
+        """The drive's rated value, which a value in per mille is of."""
+        torque = units is DRIVE_TORQUE
+        rated = self._map.rated_torque if torque else self._map.rated_current
+        if rated is None:
+            key = "rated_torque_n_m" if torque else "rated_current_arms"
+            self._add(f"{part}: {where} is in per mille of the rated value; that needs drive.{key}")
+        return rated or 1.0
 
     def _checked_plain(self, part: str, signal: Signal, where: str) -> Signal:
         """A signal that is a number of its own: an echo from 0 on, a raw state without a sign."""
@@ -253,7 +270,7 @@ class _Binder:
 
     def _first_count(self) -> int:
         """The number with which the command's counter begins; 0 where it can't be known."""
-        name = self._sent.get("u_q", ("", ""))[0]
+        name = self._lead()
         try:
             return self._database.message(name).signals[self._counters[name]].raw_range()[0]
         except (DatabaseError, KeyError):
@@ -311,10 +328,10 @@ class _Binder:
 
     def _check_echo(self) -> None:
         """The echo counts as the command does, or it names the wrong command."""
-        if "echo" not in self._received or "u_q" not in self._sent:
+        command = self._lead()
+        if "echo" not in self._received or not command:
             return
         name, signal = self._received["echo"]
-        command = self._sent["u_q"][0]
         counter = self._counters.get(command)
         if counter is None:
             self._add(f"echo: {command} has no counter to echo; name it in counters")

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from drivers.codec import Message
-from drivers.mapping import MEASURED, DriveMap
+from drivers.mapping import COMMANDED_D, COMMANDED_Q, MEASURED, DriveMap
 from drivers.payload import NO_PAYLOAD, Payload
 from drivers.signal import Signal
 
@@ -44,7 +44,7 @@ class Bound:
 
 @dataclass(frozen=True, slots=True)
 class Binding:
-    """The map's messages: to read, and to write in this order (the one with u_q last)."""
+    """The map's messages: to read, and to write in this order (the one with the command last)."""
 
     map: DriveMap
     incoming: tuple[Bound, ...]
@@ -75,15 +75,20 @@ class Binding:
             b for b in self.incoming if not b.has(MEASURED) and {p for p, _ in b.parts} != {"load_true"}
         )
 
+    def _commanded(self) -> list[Signal]:
+        """The signals of the command."""
+        parts = (*COMMANDED_Q, *COMMANDED_D)
+        return [signal for part in parts if (signal := self.signal(part))]
+
     @property
     def u_step(self) -> float:
-        """Step [V] of the voltages that both axes can carry: the coarser one's."""
-        return max(signal.step for part in ("u_q", "u_d") if (signal := self.signal(part)))
+        """Step of the command [V, A or N m] that both axes can carry: the coarser one's."""
+        return max(signal.step for signal in self._commanded())
 
     @property
     def u_top(self) -> float:
-        """Largest voltage [V] of either sign that both axes can carry."""
-        return min(signal.top for part in ("u_q", "u_d") if (signal := self.signal(part)))
+        """Largest command [V, A or N m] of either sign that both axes can carry."""
+        return min(signal.top for signal in self._commanded())
 
     @property
     def counters(self) -> dict[str, str]:
@@ -93,7 +98,7 @@ class Binding:
 
     @property
     def command(self) -> Bound:
-        """The message with u_q."""
+        """The message with the command."""
         return self.outgoing[-1]
 
     @property

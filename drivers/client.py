@@ -30,13 +30,14 @@ from drivers.frames import (
     FOREIGN_COMMAND,
     FRESH,
     LENGTH_ERROR,
+    PLACES,
     SEND_FAILED,
     SENT_FIELDS,
     SOURCES,
 )
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
-from drivers.mapping import DriveMap, house_map
+from drivers.mapping import RECEIVED, DriveMap, house_map
 from drivers.port import Compiled, Saved, SocketPort
 from drivers.posix import (
     COMMANDED,
@@ -56,7 +57,7 @@ from drivers.posix import (
 )
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
-from drivers.states import FAULT_RESET, codes_of, translator
+from drivers.states import ENABLED, FAULT_RESET, codes_of, of_controlword, translator
 from drivers.stops import STOP_PAUSE_S, Outgoing, try_all
 from drivers.tables import incoming_tables, outgoing_tables
 from drivers.wire import DATA_AT, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
@@ -193,6 +194,8 @@ class DriveClient:
         self._translate = translator(self.binding.map.states, lambda: int(self._cells[_CONTROLWORD]))
         self._flags_cell, self._state_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_state")
         self._error_cell = cell_of(tick, "drive_error")
+        self._note_absent(tick)
+        self._note_state(0)
         self._sent_cells = [cell_of(tick, name) for name in SENT_FIELDS]
         if self._port is not None:
             incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
@@ -209,9 +212,16 @@ class DriveClient:
                 self._command = self._port.commander(own | self._commanding)
         self._tick = tick
 
+    def _note_absent(self, tick: Any) -> None:
+        """What the drive does not report is no number."""
+        reported = {RECEIVED[part].field for bound in self.binding.incoming for part, _ in bound.parts}
+        for field in ("i_q", "i_d"):
+            if field not in reported:
+                tick[field] = float("nan")
+
     def compiled(self) -> Compiled | None:
         """For the record that it is prepared for; None where receiving and command are not compiled."""
-        if self._port is None or self._command is None:
+        if self._port is None or self._command is None or self.binding.map.state == "":
             return None
         places, size = self._port.places, 0 if self._sync is None else len(self._sync.view)
         return Compiled(places.get(exchange), places[follow], places[command], size, self._log)
@@ -378,6 +388,7 @@ class DriveClient:
         else:
             counter, controlword, u_q, u_d, T_L = self._sent_cells
             self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
+            self._note_state(controlword[0])
         if self._cells[_LOGGED] >= FLUSH_AT:
             self.flush()
 
@@ -400,6 +411,12 @@ class DriveClient:
             self._transmit(out)
         self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
 
+    def _note_state(self, controlword: int) -> None:
+        """A drive that does not say its state is taken to be where the command leads."""
+        if self.binding.map.state == "":
+            on = controlword == ENABLE_OPERATION
+            self._state_cell[0] = ENABLED if on else of_controlword(controlword)
+
     def _lay(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
         """Set what the encoder lays out."""
         values = self._values
@@ -410,7 +427,7 @@ class DriveClient:
         """Raise with the codec's words what of a command can't be sent."""
         bound = self.binding.outgoing[out.index]
         names = dict(bound.parts)
-        bound.encode({names[part]: self._values[i] for i, part in enumerate(SOURCES) if part in names})
+        bound.encode({name: self._values[PLACES[part]] for part, name in names.items()})
         raise EncodeError(
             f"{out.message.name}: the frame would say something else than the command; not sent"
         )

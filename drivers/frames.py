@@ -28,6 +28,12 @@ SOURCES: Final = (
     "load_enable",
 )
 """Values of a command, in the order in which they are handed to the encoder."""
+PLACES: Final = {name: place for place, name in enumerate(SOURCES)} | {
+    "i_q_ref": SOURCES.index("u_q"),
+    "i_d_ref": SOURCES.index("u_d"),
+    "torque_ref": SOURCES.index("u_q"),
+}
+"""The place of each part of a command among its values: what the drive takes goes where a voltage would."""
 SENT_FIELDS: Final = ("counter", "controlword", "u_q", "u_d", "T_L")
 """Fields of a tick that make its command."""
 CONTROLWORD: Final = SOURCES.index("controlword")

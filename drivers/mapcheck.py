@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from drivers.bound import Binding, Bound
 from drivers.codec import Message
-from drivers.mapping import MEASURED, SENT, STATES, STATUSWORD, DriveMap
+from drivers.mapping import COMMANDED_Q, SENT, STATES, STATUSWORD, DriveMap
 from drivers.node import NodeRule
 from drivers.payload import EXACT, misfit
 from drivers.signal import Signal
@@ -30,9 +30,10 @@ class Names:
 
 def mistakes_of_map(drive: DriveMap, names: Names) -> Iterator[str]:
     """Of the names alone."""
-    for part in (*MEASURED, "state", "u_q", "u_d"):
+    for part in drive.required:
         if not getattr(drive, part):
             yield f'{part}: missing; name it as "MESSAGE.Signal"'
+    yield from _one_command(drive)
     if not (drive.controlword or drive.enable):
         yield "controlword or enable: one of them must be named, or the drive can't be switched off"
     received, sent = ({name for name, _ in places.values()} for places in (names.received, names.sent))
@@ -47,6 +48,19 @@ def mistakes_of_map(drive: DriveMap, names: Names) -> Iterator[str]:
     for text in drive.units:
         if text not in known and tuple(text.split(".", 1)) not in known.values():
             yield f"units: {text} is no part of this map"
+
+
+def _one_command(drive: DriveMap) -> Iterator[str]:
+    """A drive takes one quantity, and says one way what flows."""
+    named = [part for part in COMMANDED_Q if getattr(drive, part)]
+    if len(named) > 1:
+        yield f"{' and '.join(named)}: the drive takes one of them; leave the others out"
+    if drive.u_d and not drive.u_q:
+        yield "u_d: a drive that takes a current or a torque takes no voltage; leave it out"
+    if drive.i_d_ref and not drive.i_q_ref:
+        yield "i_d_ref: goes with i_q_ref; leave it out"
+    if drive.torque and drive.i_q:
+        yield "i_q and torque: one of them tells what flows; leave the other out"
 
 
 def _twice(drive: DriveMap, names: Names) -> Iterator[str]:
@@ -133,11 +147,15 @@ def mistakes_of_values(made: Binding) -> Iterator[str]:
     """Of what will be sent: stopping must never fail on a range, and both axes have one step."""
     for bound in made.outgoing:
         yield from _unsendable(bound)
-    u_q, u_d = made.signal("u_q"), made.signal("u_d")
+    names = ("u_q", "u_d") if made.map.u_q else ("i_q_ref", "i_d_ref")
+    u_q, u_d = (made.signal(name) for name in names)
     if u_q is not None and u_d is not None:
         ratio = max(u_q.step, u_d.step) / min(u_q.step, u_d.step)
         if abs(ratio - round(ratio)) > ratio * EXACT:
-            yield f"u_q and u_d: steps of {u_q.step:g} and {u_d.step:g} V have no common one; correct the DBC"
+            yield (
+                f"{' and '.join(names)}: steps of {u_q.step:g} and {u_d.step:g} {u_q.unit} have no common "
+                "one; correct the DBC"
+            )
     for bound in made.outgoing[:-1]:
         if bound.counter and bound.counter_modulus > 0 and made.counter_modulus % bound.counter_modulus:
             yield (

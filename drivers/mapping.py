@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from drivers.codec import Database
 from drivers.errors import DatabaseError
-from drivers.units import CELSIUS, CURRENT, SPEED, TORQUE, VOLTAGE
+from drivers.units import CELSIUS, CURRENT, DRIVE_TORQUE, SPEED, TORQUE, VOLTAGE
 
 PLAIN: Final[dict[str, float]] = {}
 STATUSWORD: Final = "statusword"
@@ -44,6 +44,7 @@ RECEIVED: Final[dict[str, Part]] = {
     "speed": Part("w", SPEED, True),
     "i_q": Part("i_q", CURRENT, True),
     "i_d": Part("i_d", CURRENT, True),
+    "torque": Part("i_q", DRIVE_TORQUE, True),
     "echo": Part("echo", PLAIN),
     "state": Part("drive_state", PLAIN),
     "limited": Part("limited", PLAIN),
@@ -59,10 +60,24 @@ SENT: Final[dict[str, Part]] = {
     "reset": Part("", PLAIN),
     "u_q": Part("u_q", VOLTAGE, True),
     "u_d": Part("u_d", VOLTAGE, True),
+    "i_q_ref": Part("u_q", CURRENT, True),
+    "i_d_ref": Part("u_d", CURRENT, True),
+    "torque_ref": Part("u_q", DRIVE_TORQUE, True),
     "load_torque": Part("T_L", TORQUE, True),
     "load_enable": Part("", PLAIN),
 }
-MEASURED: Final = ("speed", "i_q", "i_d")
+MEASURED: Final = ("speed", "i_q", "i_d", "torque")
+COMMANDED_Q: Final = ("torque_ref", "i_q_ref", "u_q")
+COMMANDED_D: Final = ("u_d", "i_d_ref")
+"""Parts of the command, by what the drive takes; it takes one of the first."""
+REQUIRED: Final = {
+    "u_q": ("speed", "i_q", "i_d", "state", "u_q", "u_d"),
+    "i_q_ref": ("speed", "i_q_ref"),
+    "torque_ref": ("speed", "torque_ref"),
+}
+"""What a map must have, by what the drive takes."""
+NO_KEYS: Final = ("pole_pairs", "k_t", "rated_torque", "rated_current")
+"""Of a map what the configuration says elsewhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,24 +87,34 @@ class DriveMap:
 
     An empty part is not there. ``counters``: the frame counter of each message that has one. ``constants``:
     signals that are always sent with a value. ``units``: the unit of a part (or ``MESSAGE.Signal``) for which
-    the DBC has another, none or an unknown one. ``pole_pairs``: for electrical speeds. ``states``: CiA 402's
-    name for each raw value of ``state``, or "statusword" to decode CiA 402's; empty when the values are hil's
-    own. A state named "off" reads as what the last controlword leads to short of operation, for drives that
-    know only on and off.
+    the DBC has another, none or an unknown one. ``pole_pairs``: for electrical speeds; ``k_t`` [N m/A]: for a
+    torque in place of i_q; ``rated_torque`` [N m], ``rated_current`` [A]: for values in per mille.
+    ``states``: CiA 402's name for each raw value of ``state``, or "statusword" to decode CiA 402's; empty
+    when the values are hil's own. A state named "off" reads as what the last controlword leads to short of
+    operation, for drives that know only on and off. A drive without a state is taken to be where the command
+    leads.
     """
 
-    speed: str
+    speed: str = ""
     """Mechanical speed w, or electrical, as its unit in the DBC says."""
-    i_q: str
+    i_q: str = ""
     """Current i_q."""
-    i_d: str
+    i_d: str = ""
     """Current i_d."""
-    state: str
+    torque: str = ""
+    """Torque in place of i_q, of a drive that takes a current or a torque."""
+    state: str = ""
     """State of the drive; see states."""
-    u_q: str
+    u_q: str = ""
     """Voltage command u_q."""
-    u_d: str
+    u_d: str = ""
     """Voltage command u_d."""
+    i_q_ref: str = ""
+    """Current command i_q*, of a drive that takes a current."""
+    i_d_ref: str = ""
+    """Current command i_d*, which is held at 0."""
+    torque_ref: str = ""
+    """Torque command, of a drive that takes a torque."""
     controlword: str = ""
     """CiA 402 controlword; or enable."""
     enable: str = ""
@@ -130,8 +155,19 @@ class DriveMap:
     """Unit of a part or a MESSAGE.Signal for which the DBC has another, none or an unknown one."""
     pole_pairs: int | None = None
     """Pole pairs, for electrical speeds."""
+    k_t: float | None = None
+    """Torque constant of the drive, for a torque in place of i_q."""
+    rated_torque: float | None = None
+    """Rated torque, for torques in per mille."""
+    rated_current: float | None = None
+    """Rated current (peak), for currents in per mille."""
     states: Mapping[int, str] | str = field(default_factory=dict)
     """CiA 402's name for each raw value of state, or "statusword"."""
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Parts that it must have."""
+        return REQUIRED[next((part for part in COMMANDED_Q if getattr(self, part)), "u_q")]
 
 
 def house_map(database: Database) -> DriveMap:
@@ -168,12 +204,12 @@ def house_map(database: Database) -> DriveMap:
 
 def map_from_table(table: Mapping[str, Any], where: str) -> DriveMap:
     """A map from a config's ``[drive.signals]``. Raises DatabaseError that names all mistakes."""
-    fields = {one.name: one for one in dataclasses.fields(DriveMap) if one.name != "pole_pairs"}
+    fields = [one.name for one in dataclasses.fields(DriveMap) if one.name not in NO_KEYS]
     mistakes = [f"{key}: unknown; known are {', '.join(fields)}" for key in table if key not in fields]
-    required = [name for name, one in fields.items() if _is_required(one)]
+    required = REQUIRED[next((part for part in COMMANDED_Q if table.get(part)), "u_q")]
     mistakes += [f'{name}: missing; name it as "MESSAGE.Signal"' for name in required if name not in table]
     values: dict[str, Any] = {}
-    for key in table.keys() & fields.keys():
+    for key in table.keys() & set(fields):
         value = _value(key, table[key])
         if value is None:
             mistakes.append(f"{key}: {table[key]!r} is not of the form that it takes")
@@ -181,10 +217,6 @@ def map_from_table(table: Mapping[str, Any], where: str) -> DriveMap:
     if mistakes:
         raise DatabaseError(f"{where}: " + "; ".join(sorted(mistakes)))
     return DriveMap(**values)
-
-
-def _is_required(one: Any) -> bool:
-    return one.default is dataclasses.MISSING and one.default_factory is dataclasses.MISSING
 
 
 def _value(key: str, value: Any) -> Any:

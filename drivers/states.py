@@ -16,6 +16,7 @@ FAULT_RESET: Final = 0x80
 CONTROLWORDS: Final = (0x00, 0x02, 0x06, 0x07, ENABLE_OPERATION, FAULT_RESET)
 """Every controlword that is sent."""
 NOT_READY: Final = 0
+ENABLED: Final = 4
 # CiA 402-2, statusword 6041h: (mask, value) of each state
 _STATUSWORD: Final = (
     (0x4F, 0x40, 1),

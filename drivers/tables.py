@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from drivers.binding import Binding, Bound
 from drivers.codec import Message
-from drivers.frames import SOURCES, STATUS
+from drivers.frames import PLACES, STATUS
 from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
 from drivers.mapping import MEASURED, RECEIVED
 from drivers.signal import Signal
@@ -98,7 +98,7 @@ def outgoing_tables(binding: Binding) -> tuple[Records, Records]:
     tables = Tables()
     for bound in binding.outgoing:
         signals = bound.message.signals
-        tables.add(bound, [(signals[name], 0, 0, SOURCES.index(part), False) for part, name in bound.parts])
+        tables.add(bound, [(signals[name], 0, 0, PLACES[part], False) for part, name in bound.parts])
     return tables.records()
 
 

@@ -14,6 +14,8 @@ from typing import Final
 
 ELECTRICAL: Final = math.nan
 """Stands for the factor of a speed that counts electrical turns: it is pi / 30 by the pole pairs."""
+RATED: Final = math.inf
+"""Stands for the factor of a value in thousandths of the drive's rated one."""
 _TURN: Final = 2.0 * math.pi
 _RMS: Final = math.sqrt(2.0)
 
@@ -39,16 +41,19 @@ CURRENT: Final = _table(
     (1e-3, "mA mApk mAmp"),
     (_RMS, "Arms A_rms Aeff Amprms"),
     (1e-3 * _RMS, "mArms mA_rms"),
+    (RATED, "permille per_mille promille ‰ 1/1000 0.1%"),
 )
 VOLTAGE: Final = _table((1.0, "V Vpk Vp Vpeak V_peak Volt Volts VDC V_dc"), (1e-3, "mV"), (1e3, "kV"))
 CELSIUS: Final = _table((1.0, "degC C °C ºC ℃ Celsius degreeC degreesC gradC degCelsius deg_C"))
 TORQUE: Final = _table((1.0, "Nm N_m newtonmeter newtonmetre"), (1e-3, "mNm"), (1e3, "kNm"))
+DRIVE_TORQUE: Final = TORQUE | _table((RATED, "permille per_mille promille ‰ 1/1000 0.1%"))
 FIRST: Final = {
     id(SPEED): "rad/s",
     id(CURRENT): "A",
     id(VOLTAGE): "V",
     id(CELSIUS): "degC",
     id(TORQUE): "N m",
+    id(DRIVE_TORQUE): "N m",
 }
 _SHOWN: Final = {
     id(SPEED): "rad/s, rpm, 1/min, rev/s, deg/s, erpm",
@@ -56,6 +61,7 @@ _SHOWN: Final = {
     id(VOLTAGE): "V, mV, kV",
     id(CELSIUS): "degC",
     id(TORQUE): "N m, mNm",
+    id(DRIVE_TORQUE): "N m, mNm, per mille",
 }
 _SPELLING: Final = str.maketrans({"⁻": "-", "¹": "1", "−": "-"} | dict.fromkeys("·*×⋅ \xa0\t[]"))
 _MILLI: Final = re.compile(r"M(?=v|a|n)", re.IGNORECASE)
@@ -63,10 +69,11 @@ _MILLI: Final = re.compile(r"M(?=v|a|n)", re.IGNORECASE)
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """A unit that is known: its factor to SI."""
+    """A unit that is known: its factor to SI, or of what it counts: electrical turns, the rated value."""
 
     factor: float
     electrical: bool = False
+    rated: bool = False
 
 
 def shown(units: Mapping[str, float]) -> str:
@@ -90,4 +97,6 @@ def unit_of(text: str, units: Mapping[str, float]) -> Unit | None:
         factor = {name.lower(): value for name, value in units.items()}.get(wanted.lower())
     if factor is None:
         return None
+    if math.isinf(factor):
+        return Unit(1e-3, rated=True)
     return Unit(math.pi / 30.0, electrical=True) if math.isnan(factor) else Unit(factor)

@@ -9,11 +9,12 @@ import numpy as np
 from drivers.binding import Binding
 from drivers.client import OnFrames
 from drivers.errors import DatabaseError
+from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from drivers.wire import FRAME
 
 
 class CommandWatch:
-    """Remembers the voltages [V] of each valid command seen, by its counter.
+    """Remembers each valid command seen [V, A or N m], by its counter.
 
     A drive without echo is taken to apply the newest. Raises DatabaseError for u_q and u_d in two messages.
     """
@@ -22,10 +23,11 @@ class CommandWatch:
         bound = binding.command
         self._message, self._echo = bound.message, bool(binding.map.echo)
         parts = dict(bound.parts)
-        if "u_d" not in parts:
+        if "u_q" in parts and "u_d" not in parts:
             raise DatabaseError("a shadow run needs u_q and u_d in one message; drop --shadow")
+        axes = [parts[part] for part in (*COMMANDED_Q, *COMMANDED_D) if part in parts]
         counter = [bound.counter] if bound.counter else []
-        self._read = self._message.reader(parts["u_q"], parts["u_d"], *counter)
+        self._axes, self._read = len(axes), self._message.reader(*axes, *counter)
         self._by_counter = [(0.0, 0.0)] * bound.counter_modulus
         self._newest = (0.0, 0.0)
 
@@ -44,8 +46,9 @@ class CommandWatch:
     def take(self, data: bytes) -> None:
         """Take note of a command, whole and valid or not at all."""
         if len(data) == self._message.length and self._message.valid(data):
-            u_q, u_d, *counter = self._read(data)
-            self._newest = (u_q, u_d)
+            values = self._read(data)
+            counter = values[self._axes :]
+            self._newest = (values[0], values[1] if self._axes > 1 else 0.0)
             self._by_counter[int(counter[0]) % len(self._by_counter) if counter else 0] = self._newest
 
     def after(self, flush: Callable[[], None]) -> Callable[[int], tuple[float, float]]:
@@ -58,5 +61,5 @@ class CommandWatch:
         return applied
 
     def applied(self, echo: int) -> tuple[float, float]:
-        """Voltages of the newest command with that counter; zeros when none was seen."""
+        """The newest command (q, d) with that counter; zeros when none was seen."""
         return self._by_counter[echo % len(self._by_counter)] if self._echo else self._newest

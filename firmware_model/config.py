@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
 
+from firmware_model.current import gains
 from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.load import coupler_torque_max
-from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State
+from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State, Takes
 
 Positive = Annotated[float, Field(ge=1e-12, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
@@ -138,6 +139,16 @@ class Firmware(Table):
     """Time constant of the winding's temperature."""
     status_every: Annotated[int, Field(ge=1, le=10**6)] = 10
     """SYNCs from one status message to the next."""
+    takes: Literal["voltage", "current", "torque"] = "voltage"
+    """What a command is; for a current or a torque the drive has a current loop of its own."""
+    current_loop_rad_s: Positive = 1000.0
+    """Bandwidth of the drive's own current loop."""
+    current_period_us: Annotated[int, Field(ge=1, le=100_000)] = 50
+    """Sample time of the drive's own current loop."""
+    i_limit_a: Positive | None = None
+    """Limit of the current that the drive's own loop is asked for; left out: none."""
+    torque_constant_n_m_a: Positive | None = None
+    """By what the drive makes a current of a torque; left out: the motor's own constant."""
 
 
 class ConstantLoad(Table):
@@ -329,6 +340,25 @@ def _load_row(load: Any) -> tuple[int, float, float, float]:
     return int(LoadKind.COUPLER), top, load.slip_at_max_rad_s, load.other_side_rad_s
 
 
+def _current_loop(motor: PlantMotor, firmware: Firmware) -> dict[str, float]:
+    """The drive's own current loop, where it has one."""
+    takes = Takes[firmware.takes.upper()]
+    if not takes:
+        return {}
+    T, b = firmware.current_period_us * 1e-6, firmware.current_loop_rad_s
+    (gain_q, reset_q), (gain_d, reset_d) = (gains(motor.R_s_ohm, L, b, T) for L in (motor.L_q_h, motor.L_d_h))
+    return {
+        "takes": int(takes),
+        "drive_k_t": firmware.torque_constant_n_m_a or 1.5 * motor.n_p * motor.psi_f_wb,
+        "i_limit": firmware.i_limit_a or math.inf,
+        "current_ns": firmware.current_period_us * 1000,
+        "gain_q": gain_q,
+        "gain_d": gain_d,
+        "reset_q": reset_q,
+        "reset_d": reset_d,
+    }
+
+
 def build_params(config: PlantConfig, wire: Wire) -> Record:
     """The parameter record of a plant: a one-element array of PARAMS."""
     p = np.zeros(1, PARAMS)
@@ -372,7 +402,7 @@ def build_params(config: PlantConfig, wire: Wire) -> Record:
         "brake_on": inverter.brake_on_v or math.inf,
         "brake_off": inverter.brake_off_v or 0.0,
         "v_trip": inverter.v_dc_trip_v or math.inf,
-    }
+    } | _current_loop(motor, firmware)
     for name, value in values.items():
         p[name] = value
     for j, load in enumerate(config.all_loads):

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_model.current import refer, regulate
 from firmware_model.jit import jit
 from firmware_model.link import link_voltage
 from firmware_model.load import edge_after, load_torque
@@ -38,6 +39,7 @@ def gates_off(s: Any) -> None:
     s["u_q"], s["u_d"], s["T_commanded"] = 0.0, 0.0, 0.0
     s["x"][1], s["x"][2] = 0.0, 0.0
     s["limited"] = 0
+    s["q_ref"], s["d_ref"], s["q_total"], s["d_total"] = 0.0, 0.0, 0.0, 0.0
 
 
 @jit
@@ -83,8 +85,12 @@ def advance(p: Any, s: Any, dt_ns: int) -> None:
         if edge < s["t_ns"] + step:
             step = max(int(np.rint(edge)) - s["t_ns"], 1)
             edge = edge_after(p, s["t_ns"] + step)
-        h = step * 1e-9
         on = s["state"] == State.OPERATION_ENABLED
+        if p["takes"] > 0:
+            step = min(step, p["current_ns"] - s["t_ns"] % p["current_ns"])
+            if on and s["t_ns"] % p["current_ns"] == 0:
+                regulate(p, s)
+        h = step * 1e-9
         if p["rubs"] or p["capacitance"] > 0.0:
             rub(p, s, s["t_ns"] * 1e-9, h, on)
         else:
@@ -142,7 +148,10 @@ def transition(s: Any, controlword: int) -> None:
 
 @jit
 def latch(p: Any, s: Any) -> None:
-    """Apply the newest command: state machine, then the inverter's circle v_dc / sqrt(3) and its rounding."""
+    """Apply the newest command: state machine, then the inverter's circle v_dc / sqrt(3) and its rounding.
+
+    A drive with a current loop takes it as the loop's reference.
+    """
     if s["pending"]:
         s["pending"] = 0
         s["echo"] = s["next_counter"]
@@ -152,6 +161,9 @@ def latch(p: Any, s: Any) -> None:
         s["watching"] = 0  # a drive that was switched off properly may be left alone
     if s["state"] != State.OPERATION_ENABLED:
         gates_off(s)
+        return
+    if p["takes"] > 0:
+        refer(p, s)
         return
     u_q, u_d = s["next_q"], s["next_d"]
     if p["u_lsb"] > 0.0:

@@ -15,7 +15,9 @@ from drivers.errors import DatabaseError
 from firmware_model.config import Wire
 from firmware_model.kernels import Kernels
 
-VOLTAGE_MODE: Final = 0
+VOLTAGE_MODE, CURRENT_MODE = 0, 1
+COMMANDED: Final = {"VoltageQ": VOLTAGE_MODE, "CurrentQ": CURRENT_MODE}
+"""The mode that a command must have, by the signal that its DBC has in it."""
 Sent = tuple[int, bytes, bool]
 """Identifier as it stands in the frame, data, FD."""
 MEASURED: Final = {
@@ -43,7 +45,10 @@ class HouseFrames:
     beat_ns = 100_000_000
 
     def __init__(self, database: Database, *, truth: bool) -> None:
-        self.command = database.message("COMMAND", "Counter", "Mode", "Controlword", "VoltageQ", "VoltageD")
+        current = "CurrentQ" in database.message("COMMAND").signals
+        self.axes = ("CurrentQ", "CurrentD") if current else ("VoltageQ", "VoltageD")
+        self.mode = COMMANDED[self.axes[0]]
+        self.command = database.message("COMMAND", "Counter", "Mode", "Controlword", *self.axes)
         self.load_command = database.optional("LOAD_COMMAND")
         self.status = database.message("STATUS", *SLOW) if database.optional("STATUS") else None
         measured = MEASURED if self.status else MEASURED | SLOW
@@ -60,7 +65,7 @@ class HouseFrames:
         load, command = self.load_command, self.command
         self._read_load = load.reader("Counter", "Enable", "LoadTorque") if load else None
         self._read_mode = command.reader("Mode")
-        self._read_command = command.reader("Counter", "Controlword", "VoltageQ", "VoltageD")
+        self._read_command = command.reader("Counter", "Controlword", *self.axes)
         self.inline_load = "LoadTorque" in command.signals
         self._read_inline = command.reader("LoadEnable", "LoadTorque") if self.inline_load else None
         self.ignored: Counter[str] = Counter()
@@ -124,7 +129,7 @@ class HouseFrames:
         if not self._acceptable(self.command, data):
             return
         counter, controlword, u_q, u_d = self._read_command(data)
-        if self._read_mode(data)[0] != VOLTAGE_MODE:
+        if self._read_mode(data)[0] != self.mode:
             self.ignored["mode"] += 1
             return
         if counter == self._counters[LAST_COMMAND]:

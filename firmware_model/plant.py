@@ -47,6 +47,14 @@ class ErrorCode(IntEnum):
     COMMUNICATION_TIMEOUT = 0x8130
 
 
+class Takes(IntEnum):
+    """What the drive takes as a command."""
+
+    VOLTAGE = 0
+    CURRENT = 1
+    TORQUE = 2
+
+
 class LoadKind(IntEnum):
     """Kinds of load torque; several add up."""
 
@@ -107,6 +115,14 @@ PARAMS: Final = np.dtype(
         ("brake_on", "f8"),
         ("brake_off", "f8"),
         ("v_trip", "f8"),
+        ("takes", "i8"),
+        ("drive_k_t", "f8"),
+        ("i_limit", "f8"),
+        ("current_ns", "i8"),
+        ("gain_q", "f8"),
+        ("gain_d", "f8"),
+        ("reset_q", "f8"),
+        ("reset_d", "f8"),
     ],
     align=True,
 )
@@ -114,7 +130,8 @@ PARAMS: Final = np.dtype(
 
 Loads use a..d as: constant (T); step (T, from, until); sine (T, frequency, phase); fan (k);
 coupler (T_max, slip at T_max, speed of the other side); brake (T, from, until). ``rubs`` 0: no friction, no
-brake; ``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage.
+brake; ``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage. ``takes``:
+what a command is (:class:`Takes`); gains [V/A] and shares of reset of the sampled current loop.
 """
 
 STATE: Final = np.dtype(
@@ -145,11 +162,15 @@ STATE: Final = np.dtype(
         ("random", "i8"),
         ("v_dc", "f8"),
         ("braking", "i8"),
+        ("q_ref", "f8"),
+        ("d_ref", "f8"),
+        ("q_total", "f8"),
+        ("d_total", "f8"),
     ],
     align=True,
 )
 """x = (w, i_q, i_d), room for its series and those of the loads; plant time from the first SYNC;
-latched and pending command; CiA 402 state.
+latched and pending command; CiA 402 state; references [A] and integrators [V] of the current loop.
 """
 
 SAMPLE: Final = np.dtype(

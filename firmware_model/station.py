@@ -38,7 +38,7 @@ from drivers.wire import (
 from drivers.wire import STATE as WIRE_STATE
 from firmware_model.config import Record
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
-from firmware_model.house import FIRST_ANSWER, VOLTAGE_MODE, HouseFrames
+from firmware_model.house import FIRST_ANSWER, HouseFrames
 from firmware_model.jit import COMPILED, array_at, entry, jit, places_of, waiting
 from firmware_model.plant import PARAMS, SAMPLE, STATE
 
@@ -48,10 +48,10 @@ ANSWER: Final = 1
 """What :func:`attend` returns when a SYNC was taken and the caller is to send what it is answered with; 0:
 the time is over, or it was silent. Sizes of frames are more than both."""
 HEARTBEAT_NS: Final = 100_000_000
-LAST_NS, STARTED, UNSENT, BEAT_NS, SYNC_ID, PERIOD_NS = range(6)
+LAST_NS, STARTED, UNSENT, BEAT_NS, SYNC_ID, PERIOD_NS, MODE = range(7)
 """Cells: when the plant was moved last, whether its time has begun, frames that the bus did not take, when
-the next heartbeat is due; of the configuration, the identifier of SYNC and the period of lockstep, 0 in real
-time."""
+the next heartbeat is due; of the configuration, the identifier of SYNC, the period of lockstep, 0 in real
+time, and the mode of a command."""
 NEVER_NS: Final = 2**62
 VOLTAGE, LOAD, STATUS = 1, 2, 4
 """What a message carries, as bits."""
@@ -59,7 +59,7 @@ _MODE, _CONTROLWORD, _U_Q, _U_D, _ENABLE, _T_L = range(1, 7)
 """Places of a command's signals among the values; its counter has the first."""
 _COMMAND: Final = {
     "Mode": _MODE, "Controlword": _CONTROLWORD, "VoltageQ": _U_Q, "VoltageD": _U_D,
-    "LoadEnable": _ENABLE, "LoadTorque": _T_L,
+    "CurrentQ": _U_Q, "CurrentD": _U_D, "LoadEnable": _ENABLE, "LoadTorque": _T_L,
 }  # fmt: skip
 _LOAD: Final = {"Enable": _ENABLE, "LoadTorque": _T_L}
 F8, I8, U1, U4, I4 = (np.dtype(kind) for kind in ("f8", "i8", "u1", "u4", "i4"))
@@ -87,7 +87,8 @@ class Station:
         self, link: SocketLink, frames: HouseFrames, records: tuple[Record, Record, Record], period_ns: int
     ) -> None:
         params, state, sample = records
-        self.cells = np.zeros(PERIOD_NS + 1, np.int64)
+        self.cells = np.zeros(MODE + 1, np.int64)
+        self.cells[MODE] = frames.mode
         self.cells[SYNC_ID], self.cells[PERIOD_NS] = frames.sync_id or 0, period_ns
         self.cells[BEAT_NS] = NEVER_NS
         [(beat_id, beat, _)] = frames.beat()
@@ -219,11 +220,11 @@ def take_command(places: Any, index: int, now_ns: int) -> bool:
     cells, m = array_at(places, _CELLS, I8), messages[index]
     if int(raw[4]) != m["length"] or not is_valid(raw, m):
         return False
-    values[_MODE] = VOLTAGE_MODE
+    values[_MODE] = cells[MODE]
     counter = int(phys_of(raw, m["length"], signals[m["first"]], words))
     for place in range(m["first"] + 1, m["first"] + m["count"]):
         values[signals[place]["source"]] = phys_of(raw, m["length"], signals[place], words)
-    if values[_MODE] != VOLTAGE_MODE or counter == counters[index]:
+    if values[_MODE] != cells[MODE] or counter == counters[index]:
         return False
     counters[index] = counter
     if m["bit"] & VOLTAGE and cells[STARTED] and cells[PERIOD_NS] == 0:

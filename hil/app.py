@@ -26,11 +26,13 @@ from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
 from drivers.mapping import MEASURED, RECEIVED, DriveMap, house_map, map_from_table
+from drivers.signal import Signal
 from drivers.watch import CommandWatch
 from hil import fused, realtime
 from hil.claim import ClaimedError, claimed
 from hil.clock import LockstepClock, RealClock
 from hil.config import RunConfig, load_toml
+from hil.control.registry import laws
 from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errorcodes import words
 from hil.errors import ArmingError, ConfigError, HilError
@@ -133,24 +135,42 @@ def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
     table = config.drive.signals
     if table is None:
         return house_map(database)
-    return replace(map_from_table(table, f"{where}: drive.signals"), pole_pairs=config.motor.n_p)
+    drive = config.drive
+    rated = None if drive.rated_current_arms is None else math.sqrt(2.0) * drive.rated_current_arms
+    return replace(
+        map_from_table(table, f"{where}: drive.signals"),
+        pole_pairs=config.motor.n_p,
+        k_t=config.drive_k_t,
+        rated_torque=drive.rated_torque_n_m,
+        rated_current=rated,
+    )
 
 
 def wire_facts(binding: Binding) -> WireFacts:
     """What the kernel needs of the frames, in SI units."""
     load = binding.signal("load_torque")
-    measured = [signal for part in MEASURED if (signal := binding.signal(part))]
-    assert len(measured) == 3  # noqa: S101 - a binding without them is refused
+    speed, i_q, i_d = (binding.signal(part) for part in ("speed", "i_q", "i_d"))
+    i_q = i_q or binding.signal("torque")
     return WireFacts(
         u_lsb=binding.u_step,
         T_L_lsb=load.step if load else 0.01,
         counter_modulus=binding.counter_modulus,
-        x_lsb=(measured[0].step, measured[1].step, measured[2].step),
+        x_lsb=(_step(speed), _step(i_q), _step(i_d)),
         u_top=binding.u_top,
         T_L_top=load.top if load else math.inf,
         slow=slow_messages(binding),
-        measured=tuple(part for bound in binding.incoming if bound.has(MEASURED) for part, _ in bound.parts),
+        measured=tuple(
+            "i_q" if part == "torque" else part
+            for bound in binding.incoming
+            if bound.has(MEASURED)
+            for part, _ in bound.parts
+        ),
     )
+
+
+def _step(signal: Signal | None) -> float:
+    """Resolution of a measurement; of one that there is not, any."""
+    return 1.0 if signal is None else signal.step
 
 
 def slow_messages(binding: Binding) -> tuple[SlowMessage, ...]:
@@ -184,9 +204,21 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     _check_pacing(path, config, binding)
     shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
     wire = wire_facts(binding)
-    carried = {"u_max_v": wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
+    _check_command(path, config)
+    carried = {config.command.keys[0]: wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
     check_limits(str(path), config.limits, shown, carried)
     return Setup(path, config, database, binding, wire, build(config, wire), out_of_reach(config, wire))
+
+
+def _check_command(path: Path, config: RunConfig) -> None:
+    """The controller asks for what the drive takes. Raises ConfigError."""
+    kind, takes = config.controller.kind, config.drive.takes
+    if takes not in laws()[kind].takes:
+        fit = ", ".join(name for name, law in laws().items() if takes in law.takes)
+        asked = " or ".join(laws()[kind].takes)
+        raise ConfigError(
+            str(path), [f"controller.kind: {kind} asks for a {asked}, the drive takes a {takes}; take {fit}"]
+        )
 
 
 def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:

@@ -24,11 +24,14 @@ def summary(config: RunConfig) -> str:
     bus, limits, loop = config.bus, config.limits, config.loop
     where = f"node {config.drive.node_id} on {bus.interface}:{bus.channel}"
     ends = f"{loop.duration_s:g} s" if loop.duration_s else "until stopped"
-    soft = f"{limits.soft_start_s:g} s" if limits.soft_start_s else "none: full voltage at once"
+    takes = config.command
+    soft = f"{limits.soft_start_s:g} s" if limits.soft_start_s else f"none: full {takes.takes} at once"
+    what = f"{takes.takes + 's' if takes.takes == 'voltage' else 'a ' + takes.takes}"
     return "\n".join(
         (
-            f"about to command voltages to {where}, {ends}",
-            f"  voltage     up to {limits.u_max_v:g} V, by {limits.du_max_v:g} V a tick; soft start {soft}",
+            f"about to command {what} to {where}, {ends}",
+            f"  {takes.takes:<11} up to {takes.most:g} {takes.unit}, by {takes.step:g} {takes.unit} a tick; "
+            f"soft start {soft}",
             f"  current     limited to {limits.i_max_a:g} A, trips at {limits.i_trip_a:g} A",
             f"  speed       trips at {limits.w_max_rad_s:g} rad/s",
             f"  DC link     {limits.v_dc_min_v:g} .. {limits.v_dc_max_v:g} V",

@@ -7,13 +7,15 @@ What the values mean physically is left to the modules that use them.
 from __future__ import annotations
 
 import difflib
+import math
 import re
 import tomllib
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, Union
+from typing import Annotated, Any, Final, Literal, TypeVar, Union
 
 from pydantic import (
     BaseModel,
@@ -205,8 +207,22 @@ class BusTable(Table):
     """CAN FD."""
 
 
+Takes = Literal["voltage", "current", "torque"]
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the drive takes: unit, the largest command and its largest change in a tick, and their keys."""
+
+    takes: Takes
+    unit: str
+    most: float
+    step: float
+    keys: tuple[str, str]
+
+
 class DriveTable(Table):
-    """The drive: its DBC and node."""
+    """The drive: its DBC and node, and of one with a current loop of its own what that makes of a command."""
 
     dbc: str
     """Path of the drive's DBC file, relative to this file."""
@@ -218,7 +234,29 @@ class DriveTable(Table):
     """How long to listen for the drive before arming, and in hil check."""
     signals: dict[str, Any] | None = None
     """Which signal of the DBC plays which part; left out: the house protocol (docs/protocol.md)."""
-    """Which signal of the DBC plays which part (drivers.mapping.DriveMap); None: the house protocol."""
+    current_lag_ms: Annotated[float, Field(ge=0, le=1e4, allow_inf_nan=False)] = 0.0
+    """Time constant of the drive's own current loop; 0: it follows at once."""
+    delay_ticks: Annotated[int, Field(ge=0, le=8)] = 0
+    """Ticks by which a command acts later than with the next latch."""
+    torque_constant_n_m_a: Positive | None = None
+    """By what the drive makes a current of a torque; left out: the motor's constant."""
+    rated_torque_n_m: Positive | None = None
+    """What a torque in per mille is of (CiA 402: 6076h)."""
+    rated_current_arms: Positive | None = None
+    """What a current in per mille is of (CiA 402: 6075h)."""
+    current_limit_a: Positive | None = None
+    """Limit of i_q that is set in the drive: what it cuts off would read as load."""
+
+    @property
+    def takes(self) -> Takes:
+        """What the drive takes, by the parts that its map has."""
+        return takes_of(self.signals)
+
+
+def takes_of(signals: Any) -> Takes:
+    """What a drive of that map takes."""
+    parts = signals if isinstance(signals, Mapping) else {}
+    return "torque" if parts.get("torque_ref") else "current" if parts.get("i_q_ref") else "voltage"
 
 
 def _annotation(key: Key) -> tuple[Any, Any]:
@@ -281,16 +319,24 @@ else:
 
 
 class ObserverTable(Table):
-    """The disturbance observer of the speed channel and of both current channels."""
+    """The disturbance observer of the speed channel and of both current channels.
+
+    A drive with a current loop of its own has no observer of the currents.
+    """
 
     speed: ChannelTable
     """Observer of the load torque, in the speed channel."""
-    current: ChannelTable
-    """Observer of the voltage errors, in both current channels."""
+    current: ChannelTable | None = None
+    """Observer of the voltage errors, in both current channels; a drive that takes a current or a torque has
+    none."""
 
 
 class LimitsTable(Table):
-    """What must never be exceeded. There are no defaults for the first five: a user decides them."""
+    """What must never be exceeded. There are no defaults for the first five: a user decides them.
+
+    ``u_max_v`` and ``du_max_v`` are of a drive that takes voltages; ``di_max_a`` of one that takes a current,
+    ``dtorque_max_n_m`` of one that takes a torque: the largest change of the command in a tick.
+    """
 
     w_max_rad_s: Positive
     """Largest speed |w|; above it for trip_ticks the run ends (OVER_SPEED)."""
@@ -298,10 +344,17 @@ class LimitsTable(Table):
     """Largest current that the law asks for."""
     i_trip_a: Positive
     """Current (i_q^2 + i_d^2)^1/2 above which the run ends (OVER_CURRENT); above i_max_a."""
-    u_max_v: Positive
-    """Radius of the voltage circle that no command leaves; at most V_dc / sqrt(3) can be had."""
-    du_max_v: Positive
+    u_max_v: Positive | None = None
+    """Radius of the voltage circle that no command leaves; at most V_dc / sqrt(3) can be had. Needed
+    by a drive that takes voltages, as du_max_v."""
+    du_max_v: Positive | None = None
     """Largest change of u_q and of u_d from one tick to the next."""
+    di_max_a: Positive | None = None
+    """Largest change of i_q* from one tick to the next; needed by a drive that takes a current."""
+    torque_max_n_m: Positive | None = None
+    """Largest torque that the drive is asked for; left out: what it makes of i_max_a."""
+    dtorque_max_n_m: Positive | None = None
+    """Largest change of the torque from one tick to the next; needed by a drive that takes a torque."""
     T_L_max_n_m: NonNegative = 0.0
     """Largest torque that may be commanded to a load machine (kind fac); 0: none."""
     v_dc_min_v: NonNegative = 0.0
@@ -614,6 +667,63 @@ class RunConfig(Table):
     """The CANopen drive that hil configure sets up; left out: none."""
     faults: FaultsTable = FaultsTable()
 
+    @property
+    def k_t(self) -> float:
+        """Torque constant of the motor that is believed in [N m/A]."""
+        return 1.5 * self.motor.n_p * self.motor.psi_f_wb
+
+    @property
+    def drive_k_t(self) -> float:
+        """The torque constant that the drive reckons with [N m/A]."""
+        return self.drive.torque_constant_n_m_a or self.k_t
+
+    @property
+    def command(self) -> Command:
+        """What the drive takes, with the limits of it."""
+        limits, keys = self.limits, COMMAND_KEYS[self.drive.takes]
+        step = getattr(limits, keys[1])
+        if self.drive.takes == "voltage":
+            return Command("voltage", "V", limits.u_max_v or 0.0, step, keys)
+        if self.drive.takes == "current":
+            return Command("current", "A", limits.i_max_a, step, keys)
+        most = min(limits.torque_max_n_m or math.inf, self.drive_k_t * limits.i_max_a)
+        return Command("torque", "N m", most, step, keys)
+
+
+COMMAND_KEYS: Final[dict[Takes, tuple[str, str]]] = {
+    "voltage": ("u_max_v", "du_max_v"),
+    "current": ("i_max_a", "di_max_a"),
+    "torque": ("torque_max_n_m", "dtorque_max_n_m"),
+}
+"""Keys of [limits] for the largest command and its largest change in a tick."""
+_ONLY: Final = {
+    "voltage": ("u_max_v", "du_max_v", "applied_deviation_max_v"),
+    "current": ("di_max_a",),
+    "torque": ("torque_max_n_m", "dtorque_max_n_m"),
+}
+
+
+def _of_the_drive(data: Mapping[str, Any]) -> list[str]:
+    """What is missing or means nothing for a drive that takes what this one does."""
+    drive, limits, observer = (data.get(name) for name in ("drive", "limits", "observer"))
+    takes = takes_of(drive.get("signals") if isinstance(drive, Mapping) else None)
+    problems: list[str] = []
+    if isinstance(limits, Mapping):
+        needed = COMMAND_KEYS[takes] if takes == "voltage" else COMMAND_KEYS[takes][1:]
+        problems += [f"limits.{key}: missing; add it" for key in needed if limits.get(key) is None]
+        problems += [
+            f"limits.{key}: the drive takes {_TAKEN[takes]}, no {other}; remove it"
+            for other, keys in _ONLY.items()
+            for key in keys
+            if other != takes and limits.get(key) is not None
+        ]
+    if isinstance(observer, Mapping) and takes == "voltage" and observer.get("current") is None:
+        problems.append("observer.current: missing; add it")
+    return problems
+
+
+_TAKEN: Final = {"voltage": "voltages", "current": "a current", "torque": "a torque"}
+
 
 def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> Model:
     """Load and validate ``path`` as ``model``; ``overrides`` are ``table.key=value`` in TOML syntax.
@@ -628,11 +738,15 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
 
 def validate(data: Mapping[str, Any], model: type[Model], where: str, base: Path | None) -> Model:
     """Validate ``data`` as ``model``; paths in it are relative to ``base``, and refused without one."""
+    more = _of_the_drive(data) if model is RunConfig else []
     try:
-        return model.model_validate(data, context={"include": _includer(base)})
+        made = model.model_validate(data, context={"include": _includer(base)})
     except ValidationError as error:
         problems = [_describe(problem, model) for problem in error.errors()]
-        raise ConfigError(where, problems) from None
+        raise ConfigError(where, [*problems, *more]) from None
+    if more:
+        raise ConfigError(where, more)
+    return made
 
 
 def override(data: dict[str, Any], setting: str, base: Path) -> None:

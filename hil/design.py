@@ -16,7 +16,8 @@ from hil.config import LimitsTable, MotorTable, ReferenceTable, RunConfig
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
-from hil.guard import MEASURED, MOST_MESSAGES, SAFETY_PARAMS
+from hil.control.registry import InnerLoop
+from hil.guard import MEASURED, MOST_MESSAGES, NO_I_D, NO_I_Q, SAFETY_PARAMS
 from hil.kernel import PLACED, new_safety_state, step, whole, whole_at
 from hil.log.named import to_named
 from hil.setpoint import new_setpoint_state, no_setpoint, prepare
@@ -66,6 +67,12 @@ class WireFacts:
     T_L_top: float = math.inf
     slow: tuple[SlowMessage, ...] = ()
     measured: tuple[str, ...] = ()
+
+    @property
+    def absent(self) -> int:
+        """Currents that the drive does not report; a log that lacks ``measured`` is of one that does."""
+        absent = (NO_I_Q if "i_q" not in self.measured else 0) | (NO_I_D if "i_d" not in self.measured else 0)
+        return absent if self.measured else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,14 +153,28 @@ def _values(table: Any) -> dict[str, Any]:
     return keys
 
 
-def law_spec(config: RunConfig) -> LawSpec:
-    """The law's tuning. Raises ControlDesignError only when designed."""
+def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
+    """What the drive makes of a command; None for voltages. ``told``: it reports i_q.
+
+    A torque is made a current by the drive's own constant: k_u is the motor's over the drive's.
+    """
+    drive = config.drive
+    if drive.takes == "voltage":
+        return None
+    u_i = config.drive_k_t if drive.takes == "torque" else 1.0
+    return InnerLoop(config.k_t / u_i, u_i, drive.current_lag_ms * 1e-3, drive.delay_ticks, told)
+
+
+def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
+    """The law's tuning. Raises ControlDesignError only when designed. ``told``: the drive reports i_q."""
     controller, observer = config.controller, config.observer
+    current = observer.speed if observer.current is None else observer.current
     return LawSpec(
         kind=controller.kind,
         motor=motor_model(config.motor),
         speed=ChannelSpec(observer.speed.kind, more=_values(observer.speed)),
-        current=ChannelSpec(observer.current.kind, more=_values(observer.current)),
+        current=ChannelSpec(current.kind, more=_values(current)),
+        inner=inner_loop(config, told),
         i_max=config.limits.i_max_a,
         T_L_max=config.limits.T_L_max_n_m,
         coupling=controller.compensate_coupling,
@@ -170,8 +191,8 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
         "T_s": 1.0 / rate,
         "w_max": limits.w_max_rad_s,
         "i_trip": limits.i_trip_a,
-        "u_max": min(limits.u_max_v, wire.u_top),
-        "du_max": limits.du_max_v,
+        "u_max": min(config.command.most, wire.u_top),
+        "du_max": config.command.step,
         "T_L_max": min(limits.T_L_max_n_m, wire.T_L_top),
         "v_dc_min": limits.v_dc_min_v,
         "v_dc_max": limits.v_dc_max_v,
@@ -199,6 +220,8 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     for name, value in (values | _optional(limits)).items():
         p[name] = value
     _slow_messages(p, config, wire)
+    if inner := inner_loop(config):
+        p["k_u"], p["u_i"], p["absent"] = inner.k_u, inner.u_i, wire.absent
     if config.loop.shadow:  # command and reference are somebody else's, not ours
         for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):
             p[name] = math.inf
@@ -230,8 +253,14 @@ def _slow_messages(p: Record, config: RunConfig, wire: WireFacts) -> None:
 
 
 def frozen_voltage(config: RunConfig, wire: WireFacts) -> float:
-    """Change of voltage [V] that moves a current by 20 steps of the wire within a tick: 20 LSB L / T_s."""
+    """Change of voltage [V] that moves a current by 20 steps of the wire within a tick: 20 LSB L / T_s.
+
+    Of a drive with a current loop: what moves i_q by that, or the speed where it does not report i_q.
+    """
     motor, steps = config.motor, 20.0
+    if inner := inner_loop(config):
+        speed = motor.J_kg_m2 * wire.x_lsb[0] * config.loop.rate_hz / inner.k_u
+        return max(steps * (speed if wire.absent & NO_I_Q else wire.x_lsb[1] * inner.u_i), 10.0 * wire.u_lsb)
     lsb = max(motor.L_q_h * wire.x_lsb[1], motor.L_d_h * wire.x_lsb[2])
     return max(steps * lsb * config.loop.rate_hz, 10.0 * wire.u_lsb)
 
@@ -274,7 +303,8 @@ def reference_record(table: ReferenceTable) -> Record:
 
 def build(config: RunConfig, wire: WireFacts) -> Machine:
     """Design the controller of a run. Raises ControlDesignError."""
-    law = design_law(law_spec(config), 1.0 / config.loop.rate_hz)
+    told = not wire.absent & NO_I_Q
+    law = design_law(law_spec(config, told), 1.0 / config.loop.rate_hz)
     return Machine(
         safety_params(config, wire),
         new_safety_state(),

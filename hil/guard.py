@@ -56,6 +56,9 @@ SAFETY_PARAMS: Final = np.dtype(
         ("messages", "i8"),
         ("age_max", "i8", 8),
         ("carried_by", "i8", 3),
+        ("k_u", "f8"),
+        ("u_i", "f8"),
+        ("absent", "i8"),
     ],
     align=True,
 )
@@ -63,15 +66,21 @@ SAFETY_PARAMS: Final = np.dtype(
 
 ``rules``: 1 for those of this version, 0 for those of a log that lacks the field. ``messages``: slow messages
 of the drive's map, whose age may be ``age_max`` periods; ``carried_by``: what v_dc, motor and inverter
-temperature come with, as bits of ``came``, 0 for what the drive does not send.
+temperature come with, as bits of ``came``, 0 for what the drive does not send. ``k_u``: torque per unit of
+the command of a drive that takes a current or a torque, ``u_i`` that unit per ampere; 0 for voltages.
+``absent``: currents that the drive does not report, NO_I_Q and NO_I_D.
 """
+NO_I_Q: Final = 1
+NO_I_D: Final = 2
 MEASURED: Final = 1 << 16
 """Bit of ``came`` for the messages that measure."""
 MOST_MESSAGES: Final = 8
 MOST_PERIODS: Final = 1024
 """Periods since the last measurement that are still counted; no run in operation waits so long."""
 
-SAFETY_NEUTRAL: Final[dict[str, float]] = {"rules": 0, "messages": 0, "age_max": 0, "carried_by": 0}
+SAFETY_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
+    ("rules", "messages", "age_max", "carried_by", "k_u", "u_i", "absent"), 0
+)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -160,16 +169,33 @@ def persists(s: Any, index: int, exceeded: bool, ticks: int) -> bool:
 
 
 @jit
+def currents(p: Any, s: Any, t: Any) -> tuple[float, float]:
+    """(i_q, i_d) as they are judged: where the drive reports none, what it is asked for, and no i_d."""
+    i_q = s["ua_q"] / p["u_i"] if p["absent"] & NO_I_Q else t["i_q"]
+    i_d = 0.0 if p["absent"] & NO_I_D else t["i_d"]
+    return i_q, i_d
+
+
+@jit
+def power_in(p: Any, s: Any, t: Any, i_q: float, i_d: float) -> float:
+    """1.5 (u_q i_q + u_d i_d), or of a drive with a current loop the torque times the speed [W]."""
+    if p["k_u"] > 0.0:
+        return float(p["k_u"] * s["ua_q"] * t["w"])
+    return float(1.5 * (s["ua_q"] * i_q + s["ua_d"] * i_d))
+
+
+@jit
 def windows_trip(p: Any, s: Any, t: Any) -> int:
     """Advance i2t [A2 s] and the leaky energy window [J]; return the Reason that they trip with.
 
     i2t:    s += (i^2 - i_continuous^2) T_s, not below 0
-    energy: e += 1.5 (u_q i_q + u_d i_d) T_s - e T_s / window
+    energy: e += P T_s - e T_s / window
 
     for every period since the last measurement: what was not measured counts as what is.
     """
-    i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
-    power = 1.5 * (s["ua_q"] * t["i_q"] + s["ua_d"] * t["i_d"])
+    i_q, i_d = currents(p, s, t)
+    i_squared = i_q * i_q + i_d * i_d
+    power = power_in(p, s, t, i_q, i_d)
     for _ in range(max(1, s["elapsed"])):
         s["i2t"] = max(0.0, s["i2t"] + (i_squared - p["i_continuous"] * p["i_continuous"]) * p["T_s"])
         s["energy"] = s["energy"] + power * p["T_s"] - s["energy"] * p["T_s"] / p["power_window"]
@@ -190,9 +216,11 @@ def is_frozen(p: Any, s: Any, t: Any) -> bool:
     voltage too.
     """
     seen = s["seen"]
-    same = t["w"] == seen[0] and t["i_q"] == seen[1] and t["i_d"] == seen[2]
+    i_q = 0.0 if p["absent"] & NO_I_Q else t["i_q"]
+    i_d = 0.0 if p["absent"] & NO_I_D else t["i_d"]
+    same = t["w"] == seen[0] and i_q == seen[1] and i_d == seen[2]
     if not same or t["limited"]:
-        seen[0], seen[1], seen[2] = t["w"], t["i_q"], t["i_d"]
+        seen[0], seen[1], seen[2] = t["w"], i_q, i_d
         s["seen_q"], s["seen_d"], s["frozen"], s["repeats"] = s["ua_q"], s["ua_d"], 0, 0
         return False
     dq, dd = s["ua_q"] - s["seen_q"], s["ua_d"] - s["seen_d"]
@@ -212,7 +240,8 @@ def sent(p: Any, s: Any, part: int) -> bool:
 @jit
 def all_numbers(p: Any, s: Any, t: Any) -> bool:
     """False when any measured signal is NaN or infinite. What the drive does not send is absent, no fault."""
-    if not (math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])):
+    i_q, i_d = currents(p, s, t)
+    if not (math.isfinite(t["w"]) and math.isfinite(i_q) and math.isfinite(i_d)):
         return False
     if sent(p, s, 0) and not math.isfinite(t["v_dc"]):
         return False
@@ -245,7 +274,8 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
     if not all_numbers(p, s, t):
         return Reason.NOT_A_NUMBER.value
     ticks = p["trip_ticks"]
-    i_squared = t["i_q"] * t["i_q"] + t["i_d"] * t["i_d"]
+    i_q, i_d = currents(p, s, t)
+    i_squared = i_q * i_q + i_d * i_d
     temperature = hottest(p, t)
     speed = persists(s, OVER_SPEED, abs(t["w"]) > p["w_max"], ticks)
     current = persists(s, OVER_CURRENT, i_squared > p["i_trip"] * p["i_trip"], ticks)

@@ -13,8 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.jit import array_at, jit
-from hil.control.law import LAW_PARAMS, LAW_STATE, apply, ask, is_saturated, observe, reset, to_circle
+from hil.control.law import (
+    LAW_PARAMS,
+    LAW_STATE,
+    SPEED,
+    apply,
+    ask,
+    is_saturated,
+    observe,
+    reset,
+    to_circle,
+)
 from hil.control.references import REFERENCE
+from hil.control.speed import flowed, latched
 from hil.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
 from hil.setpoint import SETPOINT_PARAMS, SETPOINT_STATE, prepare
 from hil.signals import Controlword, DriveState, GuardFlag, Reason, RxFlag
@@ -59,8 +70,25 @@ def applied_now(p: Any, s: Any, t: Any) -> None:
 
 
 @jit
+def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
+    """:func:`estimate` of a drive with a current loop: told what flowed, or by the model of that loop."""
+    fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
+    told = lp["told"] != 0
+    heard = fresh and math.isfinite(t["w"]) and (not told or math.isfinite(t["i_q"]))
+    periods = min(int(t["gap"]), int(lp["max_gap"]) + 1)
+    ls["ua"][0] = flowed(lp, ls, t["i_q"] * lp["u_i"], heard and told, periods)
+    observe(lp, ls, t["w"], 0.0, 0.0, heard, t["gap"])
+    t["ua_q"], t["ua_d"] = ls["ua"][0], 0.0
+    applied_now(p, s, t)
+    latched(lp, ls, s["ua_q"], not fresh or t["drive_state"] == DriveState.OPERATION_ENABLED)
+
+
+@jit
 def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """Advance the observer by the past periods; a measurement that is not finite is no measurement."""
+    if lp["kind"] == SPEED:
+        estimate_speed(p, s, lp, ls, t)
+        return
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
     finite = math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])
     observe(lp, ls, t["w"], t["i_q"], t["i_d"], fresh and finite, t["gap"])
@@ -131,7 +159,10 @@ def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
     supervise(p, s, t)
     if t["state"] == DriveState.OPERATION_ENABLED and before != DriveState.OPERATION_ENABLED:
         reset(law)
-        observe(q, law, t["w"], t["i_q"], t["i_d"], True, t["gap"])
+        if q["kind"] == SPEED:
+            observe(q, law, t["w"], 0.0, 0.0, True, t["gap"])
+        else:
+            observe(q, law, t["w"], t["i_q"], t["i_d"], True, t["gap"])
     u_q, u_d, T_L, saturated = control(p, s, q, law, t)
     reason = guard_command(p, s, t, u_q, u_d, T_L)
     t["guard_flags"] |= saturated

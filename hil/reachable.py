@@ -17,7 +17,8 @@ from hil.design import WireFacts
 
 def out_of_reach(config: RunConfig, wire: WireFacts) -> tuple[str, ...]:
     """One line for each thing that can't be had: key, what is wrong, what to do."""
-    return (*_speed(config, wire), *_voltage(config), *_poles(config), *_delays(config))
+    rest = (*_voltage(config), *_drive_limit(config), *_poles(config), *_delays(config))
+    return (*_speed(config, wire), *rest)
 
 
 def peak(reference: ReferenceTable) -> float:
@@ -44,6 +45,8 @@ def _speed(config: RunConfig, wire: WireFacts) -> Iterator[str]:
     if w > limits.w_max_rad_s:
         w_max = f"limits.w_max_rad_s = {limits.w_max_rad_s:g}"
         yield f"reference: reaches {w:g} rad/s, {w_max} stops it; take less"
+    if limits.u_max_v is None:
+        return
     most, needs = min(limits.u_max_v, wire.u_top), voltage_at(config, w)
     if config.controller.kind != "fac" and needs > most:
         yield (
@@ -55,6 +58,8 @@ def _speed(config: RunConfig, wire: WireFacts) -> Iterator[str]:
 def _voltage(config: RunConfig) -> Iterator[str]:
     limits = config.limits
     circle = limits.v_dc_max_v / math.sqrt(3.0)
+    if limits.u_max_v is None:
+        return
     if "v_dc_max_v" in limits.model_fields_set and limits.u_max_v > circle:
         yield (
             f"limits.u_max_v = {limits.u_max_v:g}: a DC link of v_dc_max_v = {limits.v_dc_max_v:g} V gives "
@@ -62,10 +67,23 @@ def _voltage(config: RunConfig) -> Iterator[str]:
         )
 
 
+def _drive_limit(config: RunConfig) -> Iterator[str]:
+    """What the drive cuts off would read as load."""
+    limit, asked = config.drive.current_limit_a, config.limits.i_max_a
+    if config.drive.takes == "torque":
+        asked = config.command.most / config.drive_k_t
+    if limit is not None and asked > limit:
+        yield (
+            f"limits: up to {asked:g} A are asked for, the drive's own limit is drive.current_limit_a = "
+            f"{limit:g} A, and what it cuts off would read as load; lower limits.{config.command.keys[0]}"
+        )
+
+
 def _tables(config: RunConfig) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "controller", config.controller.model_dump()
     yield "observer.speed", config.observer.speed.model_dump()
-    yield "observer.current", config.observer.current.model_dump()
+    if config.observer.current is not None:
+        yield "observer.current", config.observer.current.model_dump()
 
 
 def _poles(config: RunConfig) -> Iterator[str]:

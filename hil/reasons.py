@@ -184,7 +184,7 @@ CAUSES: Final[dict[Reason, Cause]] = {
         "the log can't be written", "look at the disk's room and rights in log.folder", fault=False),
     Reason.GUARD_PERSISTENT: Cause(
         "the guard had to change the command for too long",
-        "look at the law's tuning, and at u_max_v and du_max_v",
+        "look at the law's tuning, and at the limits of the command",
         "limits.guard_trip_ticks", "ms", _state("clamped", _period_ms),
         _limit("guard_trip_ticks", _period_ms), _flags),
     Reason.LOOP_OVERRUN: Cause(

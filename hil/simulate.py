@@ -7,6 +7,7 @@ delivers their frames, so its outputs equal those of a lockstep run to the bit.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from hil.control.law import FAC
 from hil.design import Machine
 from hil.emulate import load_plant
 from hil.errors import ConfigError
+from hil.guard import NO_I_D, NO_I_Q
 from hil.kernel import step
 from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
@@ -42,11 +44,13 @@ BLOCK: Final = 1024
 
 
 @jit
-def receive(pp: Any, ps: Any, out: Any, t: Any) -> None:
+def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int) -> None:
     """SYNC to the drive, its answer into the tick's inputs, as codec and client do it."""
     o = out[0]
     on_sync(pp[0], ps[0], o)
-    t["w"], t["i_q"], t["i_d"] = o["w"], o["i_q"], o["i_d"]
+    t["w"] = o["w"]
+    t["i_q"] = math.nan if absent & NO_I_Q else o["i_q"]
+    t["i_d"] = math.nan if absent & NO_I_D else o["i_d"]
     t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
     t["rx_flags"], t["missing"] = RxFlag.FRESH.value, ALL_MISSING
     t["T_L_true"] = o["T_L_true"]
@@ -104,7 +108,7 @@ def simulate_block(
         t["t_ns"] = (k + j) * period_ns
         t["gap"] = 1
         t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
-        receive(pp, ps, out, t)
+        receive(pp, ps, out, t, sp[0]["absent"])
         prepare(rp, gp, gs, ss, lp, tick)
         step(sp, ss, lp, ls, tick)
         deliver(lp, ps, t)

@@ -142,5 +142,5 @@ class Judged:
             "u_noise_v": float(np.sqrt(0.5 * total / count)) if count else None,
             "w_margin": 1.0 - w / limits.w_max_rad_s,
             "i_margin": 1.0 - i / limits.i_trip_a,
-            "u_margin": 1.0 - u / limits.u_max_v,
+            "u_margin": 1.0 - u / self.config.command.most,
         }

@@ -25,7 +25,8 @@ from hil.control.fac import MAX_GAP, SampledModel, sample
 from hil.control.jit import jit
 from hil.control.linalg import Array, copy, matvec, matvec_add
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
-from hil.control.registry import Channel, Plan, laws, member, observers
+from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
+from hil.control.speed import COMMANDS, ask_speed
 
 N_MAX: Final = 1024
 """Longest window D [ticks] that the record has room for."""
@@ -34,6 +35,7 @@ CASCADE: Final = 0
 FAC: Final = 1
 PI: Final = 2
 IDENTIFY: Final = 3
+SPEED: Final = 4
 ROWS: Final = 32
 """Most rows of an experiment."""
 
@@ -88,17 +90,27 @@ LAW_PARAMS: Final = np.dtype(
         ("w_run", "f8"),
         ("w_wrong", "f8"),
         ("i_brake", "f8"),
+        ("k_u", "f8"),
+        ("u_i", "f8"),
+        ("told", "i8"),
+        ("delay", "i8"),
+        ("lag", "f8"),
+        ("share", "f8"),
+        ("kappa", "f8"),
+        ("g_u", "f8"),
     ],
     align=True,
 )
 """Parameters, from ``shaped`` on neutral at zero: observers of other forms than the pair of exponentials
 (:class:`hil.control.observer.Window`), 1 in ``shaped`` when a channel has one, 1 in ``filtered`` when the law
-takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`)."""
+takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`);
+from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
 _BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
-LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS), 0.0)
+_INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
+LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS, *_INNER), 0.0)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -135,11 +147,14 @@ LAW_STATE: Final = np.dtype(
         ("cut", "i8"),
         ("level", "f8", 2),
         ("peak", "f8", 3),
+        ("inner", "f8"),
+        ("commands", "f8", COMMANDS),
     ],
     align=True,
 )
 """State; from ``h_3`` on of :func:`shape_step` (third exponential, filter), the PI law's integrators ``I``
-[A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d."""
+[A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d;
+of a drive's own current loop what flows, and the commands on their way, newest first."""
 
 Record = npt.NDArray[np.void]
 
@@ -213,6 +228,8 @@ class LawSpec:
     T_L_max: float = 0.0
     coupling: bool = True
     more: Mapping[str, Any] = field(default_factory=dict)
+    inner: InnerLoop | None = None
+    """The drive's own current loop; None for a drive that takes voltages."""
 
     def values(self) -> dict[str, Any]:
         """What the registered design takes."""
@@ -225,6 +242,20 @@ class LawSpec:
 def sampled_model(motor: MotorModel, T_s: float) -> SampledModel:
     """Exact sampled form of the joint linear model."""
     return sample(motor.A(), motor.B(), T_s)
+
+
+@functools.lru_cache(64)
+def speed_model(motor: MotorModel, k_u: float, T_s: float) -> SampledModel:
+    """Exact sampled form of J dw/dt = k_u u - B_f w + J d; the channels of the currents stand still."""
+    A, B = np.diag([-motor.B_f / motor.J, 0.0, 0.0]), np.diag([k_u / motor.J, 1.0, 1.0])
+    return sample(A, B, T_s)
+
+
+def model_of(spec: LawSpec, T_s: float) -> SampledModel:
+    """The sampled model that observer and law of this drive rest on."""
+    return (
+        sampled_model(spec.motor, T_s) if spec.inner is None else speed_model(spec.motor, spec.inner.k_u, T_s)
+    )
 
 
 def law_window(spec: LawSpec, T_s: float) -> Window:
@@ -244,17 +275,16 @@ def _window(spec: LawSpec, T_s: float) -> Window:
         if own[0] is not own[1]:
             joint = next(observer.kind for observer in own if observer.joint)
             raise ControlDesignError(f"observer kind {joint} is one for all channels: give it to both")
-        whole: Window = own[0].joint(
-            spec.speed.values(), spec.current.values(), sampled_model(spec.motor, T_s)
-        )
+        whole: Window = own[0].joint(spec.speed.values(), spec.current.values(), model_of(spec, T_s))
         return whole
     rows = ((own[0], spec.speed), (own[1], spec.current), (own[1], spec.current))
-    return side_by_side(*(_channel(o, c, i, spec.motor, T_s) for i, (o, c) in enumerate(rows)))
+    model = model_of(spec, T_s)
+    return side_by_side(*(_channel(o, c, i, model, T_s) for i, (o, c) in enumerate(rows)))
 
 
-def _channel(observer: Any, given: ChannelSpec, index: int, motor: MotorModel, T_s: float) -> Window:
+def _channel(observer: Any, given: ChannelSpec, index: int, model: SampledModel, T_s: float) -> Window:
     """The window of one channel."""
-    window: Window = observer.design(given.values(), Channel(index, T_s, sampled_model(motor, T_s)))
+    window: Window = observer.design(given.values(), Channel(index, T_s, model))
     return window
 
 
@@ -268,11 +298,24 @@ def _check(spec: LawSpec) -> None:
         raise ControlDesignError(f"{', '.join(wrong)} must be positive (B_f and T_L_max may be 0)")
 
 
+def _check_takes(spec: LawSpec, law: Any) -> None:
+    """Refuse a law for a drive that does not take what it asks for."""
+    if (spec.inner is None) == ("voltage" in law.takes):
+        return
+    takes = "voltages" if spec.inner is None else "a current or a torque"
+    fit = [one.kind for one in laws().values() if ("voltage" in one.takes) == (spec.inner is None)]
+    raise ControlDesignError(
+        f"controller.kind: {spec.kind} asks for {' or '.join(law.takes)}, the drive takes {takes}; "
+        f"take {', '.join(fit)}"
+    )
+
+
 def design_law(spec: LawSpec, T_s: float) -> Record:
     """Design a law: a one-element array of LAW_PARAMS. Raises ControlDesignError."""
     _check(spec)
     motor, law = spec.motor, member(spec.kind, laws())
-    window, model = law_window(spec, T_s), sampled_model(spec.motor, T_s)
+    _check_takes(spec, law)
+    window, model = law_window(spec, T_s), model_of(spec, T_s)
     speed = sample(np.array([[-motor.B_f / motor.J]]), np.array([[motor.k_t / motor.J]]), T_s, 1)
     params = np.zeros(1, LAW_PARAMS)
     values = {
@@ -297,7 +340,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "i_max": spec.i_max,
         "T_L_max": spec.T_L_max,
     }
-    for name, value in (values | law.design(spec.values(), Plan(motor, model, T_s))).items():
+    for name, value in (values | law.design(spec.values(), Plan(motor, model, T_s, spec.inner))).items():
         params[name] = value
     for name in ("form", "third", "g", "M", "W", "S"):
         if (part := getattr(window, name)).size:
@@ -603,6 +646,9 @@ def command(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit
 @jit
 def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: float) -> None:
     """:func:`command` before the voltage circle: s['u'] is what the law asks for."""
+    if p["kind"] == SPEED:
+        ask_speed(p, s, w_ref, dw_ref)
+        return
     look_ahead(p, s)
     if p["kind"] == FAC:
         fac_law(p, s, w_ref, dw_ref, i_q_ref)

@@ -72,23 +72,44 @@ class Observer:
 
 
 @dataclass(frozen=True, slots=True)
+class InnerLoop:
+    """What a drive with a current loop of its own makes of a command u [A or N m].
+
+    ``k_u``: torque per unit of u [N m]; ``u_i``: unit of u per ampere of i_q; ``lag`` [s]: time constant of
+    the current loop; ``delay``: ticks by which a command acts later than with the next latch; ``told``: the
+    drive reports i_q.
+    """
+
+    k_u: float
+    u_i: float
+    lag: float = 0.0
+    delay: int = 0
+    told: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
-    """What a law's design is told: the motor that is believed in, its sampled model, T_s [s]."""
+    """What a law's design is told: the motor believed in, its sampled model, T_s [s], the drive's loop."""
 
     motor: MotorModel
     model: SampledModel
     T_s: float
+    inner: InnerLoop | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A law: ``code`` selects its kernel in ``hil.control.law.command``; ``design`` yields parameters."""
+    """A law: ``code`` selects its kernel in ``hil.control.law.command``; ``design`` yields parameters.
+
+    ``takes``: what the drives take that it is for.
+    """
 
     kind: str
     doc: str
     code: int
     design: Callable[[Values, Plan], dict[str, Any]]
     keys: Mapping[str, Key] = field(default_factory=dict)
+    takes: tuple[str, ...] = ("voltage",)
 
 
 _REGISTERED: Final[list[Any]] = []

@@ -269,7 +269,7 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
     reader = command.reader("VoltageQ", "VoltageD")
     reason = int(ended) if ended.isdecimal() else None
     evidence = Evidence(log, black_box(said), reason, onset_s, row.host, acted)
-    judge(result, row.expect, evidence, setup.config.limits.u_max_v, reader, command.can_id)
+    judge(result, row.expect, evidence, setup.config.command.most, reader, command.can_id)
     verdict = replay_log(log)
     result.replay = verdict.verdict
     if verdict.verdict != "same":

@@ -57,7 +57,7 @@ def _rows(*rows: tuple[float, float, float, float, float]) -> dict[str, Any]:
 
 def top_speed(config: RunConfig, motor: MotorTable) -> float:
     """Speed of the experiments [rad/s]: within w_max, and within half the voltage by the believed psi_f."""
-    by_voltage = 0.8 * config.limits.u_max_v / (motor.n_p * motor.psi_f_wb)
+    by_voltage = 0.8 * config.command.most / (motor.n_p * motor.psi_f_wb)
     return SPEED_SHARE * min(config.limits.w_max_rad_s, by_voltage)
 
 
@@ -81,7 +81,7 @@ def standstill(config: RunConfig, motor: MotorTable) -> Step | Skipped:
     """Voltage pulses along d and q that grow until the currents reach half their limits."""
     limits, T = config.limits, 1.0 / config.loop.rate_hz
     i_d = min(CURRENT_SHARE * limits.i_max_a, 0.7 * (limits.i_d_max_a or limits.i_max_a))
-    most = 0.45 * min(2.0 * limits.u_max_v, limits.du_max_v)
+    most = 0.45 * min(2.0 * config.command.most, config.command.step)
     rows = _pulses(T)
     table = _rows(*rows) | {
         "passes": float(PASSES),

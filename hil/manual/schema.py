@@ -19,7 +19,7 @@ from pydantic import BaseModel, TypeAdapter
 
 import firmware_model.config
 import hil.config
-from drivers.mapping import DriveMap
+from drivers.mapping import NO_KEYS, DriveMap
 from firmware_model.config import PlantConfig
 from hil.campaign.plan import CovarianceTable, PlanTable
 from hil.config import RunConfig, models_in
@@ -160,7 +160,8 @@ def _table(model: type[BaseModel]) -> Schema:
 def _map_schema() -> Schema:
     """``[drive.signals]``: the fields of the map that a config gives."""
     table = TypeAdapter(DriveMap).json_schema()
-    del table["properties"]["pole_pairs"]  # the motor's
+    for name in NO_KEYS:  # said elsewhere
+        del table["properties"][name]
     for name, text in docs_of(DriveMap).items():
         if name in table["properties"]:
             table["properties"][name] |= {"description": sentence(text)}

@@ -9,6 +9,8 @@ UNITS: Final = {
     "_rad_s2": "rad/s^2",
     "_n_m_s2": "N m s^2",
     "_n_m_s": "N m s",
+    "_n_m_a": "N m/A",
+    "_arms": "A rms",
     "_kg_m2": "kg m^2",
     "_rad_s": "rad/s",
     "_n_m": "N m",

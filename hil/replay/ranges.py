@@ -7,9 +7,10 @@ from typing import Any, Final
 import numpy as np
 
 from hil.control.fac import MAX_GAP
-from hil.control.law import IDENTIFY, N_MAX, ROWS
+from hil.control.law import N_MAX, ROWS, SPEED
 from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
+from hil.control.speed import MOST_DELAY
 from hil.guard import MOST_MESSAGES
 from hil.log.named import Record
 from hil.signals import DriveState
@@ -19,11 +20,12 @@ COUNTERS: Final = 256
 RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
     "safety": {"counter_modulus": (1, COUNTERS), "messages": (0, MOST_MESSAGES)},
     "law": {
-        "kind": (0, IDENTIFY),
+        "kind": (0, SPEED),
         "max_gap": (1, MAX_GAP),
         "N": (0, N_MAX - 1),
         "form": (0, FILTER),
         "rows": (0, ROWS),
+        "delay": (0, MOST_DELAY),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},

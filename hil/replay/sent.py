@@ -21,7 +21,14 @@ from hil.replay.verdict import Difference
 from hil.signals import FIELDS, TICK, TickArray, new_ticks
 
 _KINDS = {field.name: field.kind for field in FIELDS}
-_FIELD_OF = {"load_torque": "T_L", "enable": "controlword", "reset": "controlword"}
+_FIELD_OF = {
+    "load_torque": "T_L",
+    "enable": "controlword",
+    "reset": "controlword",
+    "i_q_ref": "u_q",
+    "i_d_ref": "u_d",
+    "torque_ref": "u_q",
+}
 
 
 class SentCheck:

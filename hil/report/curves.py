@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -114,6 +114,23 @@ PLOTS: Final = (
         (_curve("temperature_motor", "motor"), _curve("temperature_inverter", "inverter", False)),
     ),
 )  # fmt: skip
+OF_VOLTAGES: Final = ("voltage_d", "d_i")
+"""Plots of what a drive that takes a current or a torque does not have."""
+
+
+def plots_of(config: RunConfig | None) -> tuple[Plot, ...]:
+    """The plots of a run: of a drive with a current loop the command is no voltage."""
+    if config is None or config.drive.takes == "voltage":
+        return PLOTS
+    title = f"{config.drive.takes}: asked by the law, sent, in effect".capitalize()
+    unit = config.command.unit
+    return tuple(
+        replace(plot, title=title, unit=unit) if plot.key == "voltage_q" else plot
+        for plot in PLOTS
+        if plot.key not in OF_VOLTAGES
+    )
+
+
 CURVES: Final = tuple(curve for plot in PLOTS for curve in plot.curves)
 KEYS: Final = tuple(curve.key for curve in CURVES)
 
@@ -139,8 +156,8 @@ def limit_lines(config: RunConfig | None, windows: tuple[int, ...]) -> dict[str,
     return {
         "speed": both(limits.w_max_rad_s, "trip"),
         "current": both(limits.i_max_a, "i_max") + both(limits.i_trip_a, "trip"),
-        "voltage_q": both(limits.u_max_v, "u_max"),
-        "voltage_d": both(limits.u_max_v, "u_max"),
+        "voltage_q": both(config.command.most, "u_max"),
+        "voltage_d": both(config.command.most, "u_max"),
         "filled": [(float(N), f"N = {N}") for N in sorted(set(windows))],
         "v_dc": [(limits.v_dc_min_v, "min"), (limits.v_dc_max_v, "max")],
         "temperature": [(limits.temperature_max_c, "max")],

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.report.collect import Run
-from hil.report.curves import CURVES, F4, F8, KEYS, PLOTS, Plot
+from hil.report.curves import CURVES, F4, F8, KEYS, Plot, plots_of
 from hil.report.statistics import SPECTRUM_FIELDS
 
 MOST_EVENTS: Final = 500
@@ -123,7 +123,7 @@ def report_data(runs: Sequence[Run]) -> dict[str, Any]:
     """Everything that the script draws."""
     return {
         "runs": [run_data(run) for run in runs],
-        "plots": [plot_data(runs, plot) for plot in PLOTS if not is_empty(runs, plot)],
+        "plots": [plot_data(runs, plot) for plot in plots_of(runs[0].config) if not is_empty(runs, plot)],
         "charts": charts(runs),
     }
 

@@ -26,7 +26,7 @@ from hil.report.criteria import (
     recovered,
     verdict_text,
 )
-from hil.report.curves import PLOTS, limits_text
+from hil.report.curves import limits_text, plots_of
 from hil.report.embed import MOST_EVENTS, charts, is_empty, report_data, script_json
 from hil.report.frames import REMOTE, id_text
 from hil.report.segments import Response
@@ -245,7 +245,7 @@ def _plots(runs: Sequence[Run]) -> str:
         f'<div class="plot" id="plot-{plot.key}"><h3>{escape(plot.title)}'
         f"{f' [{escape(plot.unit)}]' if plot.unit else ''}"
         f'<span class="soft small">{escape(limits_text(limits.get(plot.key, [])))}</span></h3></div>'
-        for plot in PLOTS
+        for plot in plots_of(runs[0].config)
         if not is_empty(runs, plot)
     )
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from hil.report.collect import Run
 from hil.report.criteria import judge
-from hil.report.curves import KEYS, PLOTS, Plot, limits_text
+from hil.report.curves import KEYS, Plot, limits_text, plots_of
 from hil.report.embed import FITTED, MOST_EVENTS, is_empty
 
 COLOURS: Final = ("#0b62c4", "#d1570a", "#15803d", "#9333ea", "#b4235a", "#0e7c86", "#7a5c00", "#50555b")
@@ -30,7 +30,7 @@ def picture(runs: Sequence[Run]) -> bytes:
 
 def figure(runs: Sequence[Run]) -> Figure:
     """The picture itself; two columns of plots."""
-    plots = [plot for plot in PLOTS if not is_empty(runs, plot)]
+    plots = [plot for plot in plots_of(runs[0].config) if not is_empty(runs, plot)]
     rows = max(1, -(-len(plots) // 2))
     with matplotlib.rc_context({"font.size": 8, "axes.grid": True, "grid.color": "#d8dde3"}):
         drawn = Figure(figsize=(INCHES[0], INCHES[1] * rows + 0.6), dpi=DPI, layout="constrained")

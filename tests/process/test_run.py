@@ -93,8 +93,11 @@ def test_the_demo_says_what_happened(configs: Path, settings: Settings) -> None:
     assert Path(result["log"]).is_file()
 
 
-def test_lockstep_twice_and_simulated_are_the_same_to_the_bit(configs: Path, settings: Settings) -> None:
-    path, own = configs / "demo.toml", settings('loop.clock="lockstep"', "loop.duration_s=3.0")
+@pytest.mark.parametrize("name", ["demo.toml", "current.toml"])
+def test_lockstep_twice_and_simulated_are_the_same_to_the_bit(
+    configs: Path, settings: Settings, name: str
+) -> None:
+    path, own = configs / name, settings('loop.clock="lockstep"', "loop.duration_s=3.0")
     overrides, logged = Overrides(settings=own), []
     setup = load_setup(path, overrides)
     for cores in ({0}, {0, 1}):

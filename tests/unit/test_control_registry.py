@@ -41,7 +41,13 @@ LAWS = {
     "current_integral_v_as=674.0",
     "lq": 'kind="lq", speed_weight=100.0',
     "deadbeat": 'kind="deadbeat"',
+    "speed": 'kind="speed"',
 }
+
+
+def config_of(law: str) -> Path:
+    """A configuration whose drive takes what the law asks for."""
+    return DEMO if "voltage" in laws()[law].takes else CONFIGS / "current.toml"
 
 
 def settings(law: str = "cascade", observer: str = "ftdob") -> tuple[str, ...]:
@@ -63,7 +69,9 @@ def test_every_member_is_tried_here() -> None:
 )
 @pytest.mark.compiled  # a whole run: interpreted it takes minutes
 def test_runs_in_simulate_and_replays_to_the_bit(tmp_path: Path, law: str, observer: str) -> None:
-    setup = load_setup(DEMO, Overrides(settings=(*settings(law, observer), f'log.folder="{tmp_path}"')))
+    setup = load_setup(
+        config_of(law), Overrides(settings=(*settings(law, observer), f'log.folder="{tmp_path}"'))
+    )
     result = simulate(setup, [])
     assert result["ended"] == "stop_requested"
     assert replay(Path(result["log"])).verdict == "same"
@@ -72,7 +80,7 @@ def test_runs_in_simulate_and_replays_to_the_bit(tmp_path: Path, law: str, obser
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.compiled  # a whole run: interpreted it takes minutes
 def test_every_law_holds_the_load(law: str) -> None:
-    ticks = simulate_ticks(load_setup(DEMO, Overrides(settings=settings(law))))
+    ticks = simulate_ticks(load_setup(config_of(law), Overrides(settings=settings(law))))
     assert Reason(int(ticks["reason"][-1])) == Reason.STOP_REQUESTED
     own = operating(ticks)
     error, t = np.abs(own["w"] - own["w_ref"]), own["t_ns"] * 1e-9

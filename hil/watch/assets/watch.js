@@ -6,7 +6,7 @@
   const PLOTS = [
     ["speed [rad/s]", [["w", "measured"], ["w_ref", "reference"]]],
     ["current [A]", [["i_q", "q"], ["i_q_ref", "q asked"], ["i_d", "d"]]],
-    ["voltage [V]", [["u_q", "q"], ["u_d", "d"]]],
+    ["command [V, or what the drive takes]", [["u_q", "q"], ["u_d", "d"]]],
     ["load torque [N m]", [["T_L_hat", "estimate"], ["T_L_true", "true"]]],
     ["lateness [us]", [["lateness_ns", "lateness"]]],
   ];

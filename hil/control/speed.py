@@ -1,0 +1,86 @@
+"""Kernels of the law for a drive with a current loop of its own: state w, input the torque asked for.
+
+The command u is a current [A] or a torque [N m], k_u its torque per unit. The drive makes of it
+    tau di/dt = u(t - delay) - i,   J dw/dt = k_u i - B_f w + J d
+Sampled exactly, with what flows at the tick (i) and the command that acts from then on (u):
+    w+ = a w + b (alpha i + (1 - alpha) u) + e d,   i+ = l i + (1 - l) u,   l = e^{-T_s / tau}
+so alpha i + (1 - alpha) u is the constant that has the same effect on w: with d it is what the observer is
+told. A drive that reports i_q tells it by itself: the mean of the samples at both ends of the tick.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from hil.control.jit import jit
+
+MOST_DELAY: Final = 8
+"""Ticks by which a command may act later than with the next latch."""
+COMMANDS: Final = MOST_DELAY + 1
+
+
+@jit
+def flowed(p: Any, s: Any, i: float, sampled: bool, periods: int) -> float:
+    """End the past ``periods``: return the constant command that had their effect on w; i [unit of u].
+
+    ``sampled``: the drive has said what flows now. Else the model of its inner loop goes on.
+    """
+    total = 0.0
+    for period in range(periods):
+        u, before = s["commands"][p["delay"]], s["inner"]
+        s["inner"] = p["lag"] * before + (1.0 - p["lag"]) * u
+        if sampled and period == periods - 1:
+            s["inner"] = i
+            total += 0.5 * (before + i)
+        else:
+            total += p["share"] * before + (1.0 - p["share"]) * u
+        for age in range(p["delay"], 0, -1):
+            s["commands"][age] = s["commands"][age - 1]
+    if periods < 1 and sampled:
+        s["inner"] = i
+    return float(total / max(periods, 1))
+
+
+@jit
+def latched(p: Any, s: Any, u: float, on: bool) -> None:
+    """Tell what the drive has latched now; with its gates off nothing flows, and nothing is on its way."""
+    s["commands"][0] = u
+    if not on:
+        s["inner"] = 0.0
+        for age in range(p["delay"] + 1):
+            s["commands"][age] = 0.0
+
+
+@jit
+def look_ahead_speed(p: Any, s: Any) -> None:
+    """x_p = (w, i) at the tick from which the next command will act: all that act before are known."""
+    w, i, d = s["x"][0], s["inner"], s["d_hat"][0]
+    for age in range(p["delay"], -1, -1):
+        u = s["commands"][age]
+        w = p["Ad"][0, 0] * w + p["Bd"][0, 0] * (p["share"] * i + (1.0 - p["share"]) * u)
+        w += p["Ed"][0, 0] * d
+        i = p["lag"] * i + (1.0 - p["lag"]) * u
+    s["x_p"][0], s["x_p"][1] = w, i
+
+
+@jit
+def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
+    """The command that moves the speed error by e^{-pole T_s} a tick and leaves the inner loop its own pole.
+
+    sigma = w + kappa i, kappa = alpha b / (a - l), is the mode of (w, i) with the eigenvalue a:
+        sigma+ = a sigma + e d + g u,   g = (1 - alpha) b + kappa (1 - l)
+    With u* = (w*+ - a w* - e d) / b, what holds the reference, sigma* = w* + kappa u*, and
+        u = (sigma*+ + lam (sigma - sigma*) - a sigma - e d) / g
+    Without a lag (kappa = 0) it is the cascade's speed law.
+    """
+    look_ahead_speed(p, s)
+    a, b, kappa, T_s = p["Ad"][0, 0], p["Bd"][0, 0], p["kappa"], p["T_s"]
+    drift = p["Ed"][0, 0] * s["d_hat"][0]
+    target = w_ref + (1.0 + p["delay"]) * T_s * dw_ref
+    after = target + T_s * dw_ref
+    holds = kappa * (after - a * target - drift) / b
+    sigma = s["x_p"][0] + kappa * s["x_p"][1]
+    wanted = after + holds + p["lam_w"] * (sigma - target - holds)
+    u = (wanted - a * sigma - drift) / p["g_u"]
+    s["u"][0], s["u"][1], s["u"][2] = 0.0, u, 0.0
+    s["i_q_ref"] = min(max(u / p["u_i"], -p["i_max"]), p["i_max"])
