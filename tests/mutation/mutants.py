@@ -36,6 +36,7 @@ SAFETY = (
     "test_supervisor_rules.py",
     "test_supervisor.py",
     "test_guard_time.py",
+    "test_guard_current.py",
 )
 JUDGES = {
     "hil/guard.py": SAFETY,
