@@ -75,7 +75,7 @@ class Cia402Frames:
         self._objects.operational = False
         self._objects.restart()
         self._count, self._position, self._total = -1, 0.0, 0.0
-        self._error, self._told, self._ramping = 0, 0, False
+        self._error, self._told, self._ramping, self._cut = 0, 0, False, False
         self._since = dict.fromkeys(TPDOS, 0)
         self._mappings: dict[int, tuple[Mapped, ...]] = {}
 
@@ -185,16 +185,21 @@ class Cia402Frames:
         return controlword & 0x06 == 0x02
 
     def _torque(self, state: Any) -> float:
-        """Torque [N m] that the mode asks for now."""
-        get, mode = self._objects.get, self._objects.get(0x6060)
-        if mode == CST:
-            return get(0x6071) * self._rated * 1e-3
+        """Torque [N m] that the mode asks for now, within 6072h."""
+        mode = self._objects.get(0x6060)
+        asked = self._objects.get(0x6071) * self._rated * 1e-3 if mode == CST else 0.0
+        if mode in (CSV, CSP):
+            asked = self._speed_loop(self._target(mode), state)
+        top = self._objects.get(0x6072) * self._rated * 1e-3
+        self._cut = abs(asked) > top
+        return max(-top, min(top, asked))
+
+    def _target(self, mode: int) -> float:
+        """Speed [rad/s] that velocity or position mode asks for."""
         if mode == CSV:
-            return self._speed_loop(get(0x60FF) * MILLI_RPM, state)
-        if mode == CSP:
-            target = get(0x607A) * 2.0 * math.pi / INCREMENTS
-            return self._speed_loop(POSITION_GAIN * (target - self._position), state)
-        return 0.0
+            return self._objects.get(0x60FF) * MILLI_RPM
+        turn = self._objects.get(0x607A) * 2.0 * math.pi / INCREMENTS
+        return POSITION_GAIN * (turn - self._position)
 
     def _speed_loop(self, w_ref: float, state: Any) -> float:
         """A PI of the drive's own, by the inertia of its motor."""
@@ -227,15 +232,14 @@ class Cia402Frames:
         state = State(int(drive.state["state"]))
         word = WORDS[State.QUICK_STOP_ACTIVE if self._ramping else state]
         word |= REMOTE if self._nmt == OPERATIONAL else 0
-        word |= LIMITED if drive.state["limited"] else 0
+        word |= LIMITED if drive.state["limited"] or self._cut else 0
         return word | (FOLLOWS if state == State.OPERATION_ENABLED and not self._ramping else 0)
 
     def _torque_now(self, drive: Kernels) -> float:
-        k_t = 1.5 * drive.params["n_p"] * drive.params["psi_f"]
-        return float(drive.sample["i_q"] * k_t)
+        return float(drive.sample["i_q"] * drive.params["drive_k_t"])
 
     def answer(self, out: dict[str, Any]) -> list[Sent]:
-        """EMCY if a fault arose or went, then each TPDO; out of operation nothing but EMCY."""
+        """EMCY if a fault arose or went, then each TPDO, the first last; out of operation nothing but EMCY."""
         drive = self._drive
         if drive is None:
             return []
@@ -245,7 +249,7 @@ class Cia402Frames:
             sent.append(self._emergency(0))
         if self._nmt != OPERATIONAL:
             return sent
-        return sent + [frame for index in TPDOS for frame in self._tpdo(index)]
+        return sent + [frame for index in reversed(TPDOS) for frame in self._tpdo(index)]
 
     def _after_sync(self, drive: Kernels) -> None:
         """What the drive's own loops and ramp do between two SYNCs."""
@@ -259,12 +263,8 @@ class Cia402Frames:
         elif self._ramping:
             self._ramp(drive, w)
         elif mode in (CSV, CSP):
-            target = self._objects.get(0x60FF) * MILLI_RPM
-            if mode == CSP:
-                turn = self._objects.get(0x607A) * 2.0 * math.pi / INCREMENTS
-                target = POSITION_GAIN * (turn - self._position)
-            self._total += (target - w) * period_s
-            state["next_q"] = self._speed_loop(target, state)
+            self._total += (self._target(mode) - w) * period_s
+            state["next_q"] = self._torque(state)
 
     def _ramp(self, drive: Kernels, w: float) -> None:
         """A quick stop that brakes with rated torque; at rest 605Ah says whether it stays."""
@@ -309,6 +309,7 @@ def _clipped(value: float, bits: int) -> int:
 
 
 _LIVE: Final[dict[int, Callable[[Cia402Frames, Kernels], float]]] = {
+    0x2000: lambda node, drive: round(drive.sample["T_L_true"] * 1e3),
     0x1001: lambda node, drive: 1 if drive.state["error"] else 0,
     0x603F: lambda node, drive: node._error if drive.state["error"] else 0,
     0x6041: lambda node, drive: node.statusword(drive),

@@ -135,15 +135,7 @@ def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
     table = config.drive.signals
     if table is None:
         return house_map(database)
-    drive = config.drive
-    rated = None if drive.rated_current_arms is None else math.sqrt(2.0) * drive.rated_current_arms
-    return replace(
-        map_from_table(table, f"{where}: drive.signals"),
-        pole_pairs=config.motor.n_p,
-        k_t=config.drive_k_t,
-        rated_torque=drive.rated_torque_n_m,
-        rated_current=rated,
-    )
+    return replace(map_from_table(table, f"{where}: drive.signals"), **config.map_facts)
 
 
 def wire_facts(binding: Binding) -> WireFacts:

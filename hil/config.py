@@ -678,6 +678,17 @@ class RunConfig(Table):
         return self.drive.torque_constant_n_m_a or self.k_t
 
     @property
+    def map_facts(self) -> dict[str, Any]:
+        """What a map of the drive's signals needs besides the signals, by DriveMap's names."""
+        rated = self.drive.rated_current_arms
+        return {
+            "pole_pairs": self.motor.n_p,
+            "k_t": self.drive_k_t,
+            "rated_torque": self.drive.rated_torque_n_m,
+            "rated_current": None if rated is None else math.sqrt(2.0) * rated,
+        }
+
+    @property
     def command(self) -> Command:
         """What the drive takes, with the limits of it."""
         limits, keys = self.limits, COMMAND_KEYS[self.drive.takes]

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from firmware_model.config import PlantMotor
-from hil.app import Overrides, RunResult, Setup, load_setup, run
+from hil.app import Overrides, RunResult, Setup, bus_settings, load_setup, run
+from hil.config import RunConfig
 from hil.control.law import MotorModel, law_window, sampled_model
 from hil.control.observer import bounds
 from hil.design import law_spec, motor_model
@@ -113,8 +114,17 @@ def closed_loop(path: Path, overrides: Overrides) -> tuple[Setup, RunResult, Log
         overrides = replace(overrides, channel=f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}")
     setup = load_setup(path, overrides)
     with emulator_process(path, overrides):
+        if setup.config.canopen is not None:
+            set_up(path, setup.config)
         result = run(setup)
     return setup, result, open_log(Path(result.log))
+
+
+def set_up(path: Path, config: RunConfig) -> None:
+    """What `hil configure` does before a run: the emulated drive has just been switched on."""
+    from hil.configure import configure, job_of
+
+    configure(job_of(path, config, bus_settings(config)), store=False, dbc=None)
 
 
 def too_slow(setup: Setup, result: RunResult, log: Log) -> str:

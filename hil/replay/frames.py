@@ -50,7 +50,7 @@ def binding_of(log: Log) -> tuple[Binding, RunConfig]:
     table = config.drive.signals
     parts = house_map(database)
     if table is not None:
-        parts = replace(map_from_table(table, "drive.signals"), pole_pairs=config.motor.n_p)
+        parts = replace(map_from_table(table, "drive.signals"), **config.map_facts)
     return bind(parts, database, load=config.controller.kind == "fac"), config
 
 
