@@ -239,7 +239,7 @@ class Cia402Frames:
         return float(drive.sample["i_q"] * drive.params["drive_k_t"])
 
     def answer(self, out: dict[str, Any]) -> list[Sent]:
-        """EMCY if a fault arose or went, then each TPDO, the first last; out of operation nothing but EMCY."""
+        """EMCY if a fault arose or went, then each TPDO, the first last; out of operation EMCY alone."""
         drive = self._drive
         if drive is None:
             return []

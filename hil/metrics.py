@@ -80,7 +80,7 @@ def find_step(ticks: TickArray, at_least: float = 0.5) -> int | None:
 
 def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -> npt.NDArray[np.float64]:
     """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed linear model's."""
-    w, i_q, i_d = ticks["w"], ticks["i_q"], ticks["i_d"]
+    w, i_q, i_d = ticks["w"], ticks["i_q"], np.nan_to_num(ticks["i_d"])  # not reported: held at zero
     torque = 1.5 * true.n_p * (true.psi_f + (true.L_d - true.L_q) * i_d) * i_q
     real = (torque - ticks["T_L_true"] - true.B_f * w) / true.J
     out: npt.NDArray[np.float64] = real - (believed.k_t * i_q - believed.B_f * w) / believed.J

@@ -21,11 +21,7 @@ from hil.configure import Job, job_of
 from tests.conftest import CONFIGS
 
 NODE = 5
-TABLE = """
-[canopen]
-eds = "drives/cia402.eds"
-mode = "cst"
-"""
+OWN = ("tpdo", "rpdo_timeout_ms", "load_true", "[drive.signals.units]")
 EDS = CONFIGS / "drives" / "cia402.eds"
 
 
@@ -34,13 +30,11 @@ def bus_of(channel: str) -> BusSettings:
 
 
 def run_config(configs: Path) -> Path:
-    """A run configuration with the emulated CiA 402 drive."""
+    """The shipped configuration, every object by the mode alone."""
     path = configs / "canopen.toml"
     if not path.exists():
-        text = (configs / "demo.toml").read_text(encoding="utf-8")
-        text = text.replace('"drives/hil_pmsm.dbc"\nnode_id = 1', f'"drives/cia402.dbc"\nnode_id = {NODE}')
-        text = text.replace("plants/demo.toml", "plants/cia402.toml")
-        path.write_text(text + TABLE, encoding="utf-8")
+        lines = (configs / "cia402.toml").read_text(encoding="utf-8").splitlines(keepends=True)
+        path.write_text("".join(line for line in lines if not line.startswith(OWN)), encoding="utf-8")
     return path
 
 
