@@ -25,6 +25,7 @@ from hil.errors import ConfigError, HilError
 from hil.outputs import output_file
 
 LISTEN_S = 0.05
+TORQUE, MOST_TORQUE = 0x6071, 0x6072
 
 
 @dataclass(slots=True)
@@ -226,8 +227,11 @@ def _result(job: Job, sdo: Sdo, scales: Scales) -> Result:
     period_ms = job.config.loop.period_ns * 1e-6
     text = dbc_of(job.plan, job.node_id, scales, period_ms, job.table.heartbeat_ms, what)
     objects = list(node.compare(sdo, job.plan))
+    limits = limit_problems(job, sdo, scales)
     told, options = scales.told, node.options(sdo)
-    return Result(job.node_id, str(job.eds.path), job.table.mode, identity, told, options, objects, [], text)
+    return Result(
+        job.node_id, str(job.eds.path), job.table.mode, identity, told, options, objects, limits, text
+    )
 
 
 def _refuse_unkept(job: Job, result: Result) -> None:
@@ -239,6 +243,22 @@ def _refuse_unkept(job: Job, result: Result) -> None:
             f"node {job.node_id} took it and holds another value: {'; '.join(bad)}"
             f"{fixed if job.plan.fixed else ''}; nothing is enabled"
         )
+
+
+def limit_problems(job: Job, sdo: Sdo, scales: Scales) -> list[str]:
+    """A torque that the drive would cut off reads as load: its own limit must be the larger one."""
+    if job.config.drive.takes != "torque":
+        return []
+    raw, scale = sdo.optional_int(MOST_TORQUE), scales.of(TORQUE)
+    if raw is None or scale is None:
+        return []
+    top, most = float(raw * scale.factor), job.config.command.most
+    if most <= top:
+        return []
+    return [
+        f"limits.i_max_a asks for up to {most:.4g} N m, the drive cuts off at {top:.4g} N m (6072h), which "
+        "reads as load: lower it, or raise 6072h"
+    ]
 
 
 def dbc_problems(job: Job, result: Result) -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,10 +20,12 @@ from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
 from hil.config import RunConfig, load_toml
 from hil.configure import Job, job_of
-from tests.conftest import CONFIGS
+from tests.conftest import CONFIGS, ROOT
 
 NODE = 5
 OWN = ("tpdo", "rpdo_timeout_ms", "load_true", "[drive.signals.units]")
+PATIENT = "canopen.answer_timeout_s=5.0"
+"""A busy machine lets a thread wait."""
 EDS = CONFIGS / "drives" / "cia402.eds"
 
 
@@ -41,7 +45,7 @@ def run_config(configs: Path) -> Path:
 def job(configs: Path, channel: str, *settings: str) -> Job:
     """The job of that config on a bus of its own."""
     path = run_config(configs)
-    return job_of(path, load_toml(path, RunConfig, settings), bus_of(channel))
+    return job_of(path, load_toml(path, RunConfig, [PATIENT, *settings]), bus_of(channel))
 
 
 @contextlib.contextmanager
@@ -95,3 +99,16 @@ def recorded(channel: str) -> Iterator[list[can.Message]]:
     finally:
         notifier.stop()
         bus.shutdown()
+
+
+@contextlib.contextmanager
+def durand_drive(channel: str, eds: Path) -> Iterator[None]:
+    """A drive on durand, a stack of strangers, as a process of its own; its EDS goes to a file."""
+    words = [sys.executable, "-m", "tests.durand402", channel, str(eds)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "ready\n"
+            yield
+        finally:
+            process.terminate()

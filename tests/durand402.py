@@ -111,6 +111,7 @@ def serve(channel: str, eds: Path, stopped: Callable[[], bool]) -> None:
     wire = Wire(link)
     drive = Drive(wire)
     eds.write_text(drive.node.eds.content, encoding="utf-8")
+    print("ready", flush=True)
     try:
         wire.serve(stopped, clock)
     finally:

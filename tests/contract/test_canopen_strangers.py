@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,23 +12,17 @@ import pytest
 
 from drivers.errors import DatabaseError, NodeError
 from hil.configure import compare, configure
-from tests.canopen import NODE, job
+from tests.canopen import NODE, durand_drive, job
 
-durand402 = pytest.importorskip("tests.durand402", reason="durand is not there: pip install durand")
 Refused = (DatabaseError, NodeError)
 
 
 @pytest.fixture
 def eds(configs: Path, channel: str) -> Iterator[str]:
     """A durand drive on the channel; the setting of its EDS."""
-    path, over = configs / "durand.eds", threading.Event()
-    thread = threading.Thread(target=durand402.serve, args=(channel, path, over.is_set), daemon=True)
-    thread.start()
-    while not path.exists() or not path.read_text(encoding="utf-8"):
-        time.sleep(0.01)
-    yield f'canopen.eds="{path}"'
-    over.set()
-    thread.join(5)
+    path = configs / "durand.eds"
+    with durand_drive(channel, path):
+        yield f'canopen.eds="{path}"'
 
 
 def test_it_is_set_up_and_moves_with_sync(configs: Path, channel: str, eds: str) -> None:

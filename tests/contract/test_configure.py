@@ -345,3 +345,13 @@ def test_a_dbc_that_says_else_than_the_drive(configs: Path, channel: str) -> Non
         problems = compare(made).problems
     assert len(problems) == 2 and all("0.01368 Nm" in p and "0.02 Nm" in p for p in problems)
     assert EDS.exists()
+
+
+@pytest.mark.parametrize(("i_max", "fits"), [(10.0, True), (15.0, False)])
+def test_a_torque_that_the_drive_cuts_off(configs: Path, channel: str, i_max: float, fits: bool) -> None:
+    """6072h lets 3 x 13.68 = 41.04 N m through; 15 A by 3.6 N m/A are 54 N m."""
+    with emulated(configs, channel):
+        set_up(configs, channel)
+        problems = compare(job(configs, channel, f"limits.i_max_a={i_max}")).problems
+    said = "limits.i_max_a asks for up to 54 N m, the drive cuts off at 41.04 N m (6072h)"
+    assert problems == [] if fits else len(problems) == 1 and problems[0].startswith(said)

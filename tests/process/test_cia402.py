@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +14,14 @@ from hil.app import Overrides
 from hil.demo import emulator_process
 from hil.log.reader import open_log
 from hil.signals import DriveState
-from tests.canopen import NODE, recorded, run_config
+from tests.canopen import NODE, PATIENT, durand_drive, recorded, run_config
 from tests.process.test_run import call, flags
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
 NMT, SYNC, RPDO = 0x000, 0x080, 0x200 + NODE
-SHORT = ('loop.clock="lockstep"', "loop.duration_s=1.6", "reference.at_s=0.05", "reference.rate_rad_s2=400.0",
-         "reference.jerk_rad_s3=20000.0", "reference.down_at_s=1.4")  # fmt: skip
+SHORT = (PATIENT, 'loop.clock="lockstep"', "loop.duration_s=1.6", "reference.at_s=0.05",
+         "reference.rate_rad_s2=400.0", "reference.jerk_rad_s3=2e4", "reference.down_at_s=1.4")  # fmt: skip
 
 
 @pytest.fixture
@@ -55,11 +52,10 @@ def test_the_demo_closes_the_loop(path: Path, settings: Settings) -> None:
     assert result["estimate_error_after_n"] < 0.02 * abs(result["estimate_step_rad_s2"])
     assert 1.0 < result["dip_rad_s"] < 5.0
     log = open_log(Path(result["log"]))
-    frames = log.frames
-    sent = frames[frames["received"] == 0]
-    nmt = sent[sent["can_id"] == NMT]
-    assert [bytes(data[:2]) for data in nmt["data"]] == [bytes((0x01, NODE)), bytes((0x80, NODE))]
-    assert sent["can_id"][0] == NMT and sent["can_id"][-1] == NMT
+    sent = [(frame.can_id, frame.data) for frame in log.frames if not frame.received]
+    start, leave = (NMT, bytes((0x01, NODE))), (NMT, bytes((0x80, NODE)))
+    assert sent[0] == start and sent[-1] == leave
+    assert [one for one in sent if one[0] == NMT] == [start, leave]
     ticks = log.ticks
     assert np.isnan(ticks["i_d"]).all() and (ticks["drive_state"] == DriveState.OPERATION_ENABLED).any()
 
@@ -84,27 +80,6 @@ def test_a_drive_that_lost_its_mapping_is_found_before_arming(
 def check(path: Path, own: tuple[str, ...]) -> dict[str, str]:
     done = call("check", str(path), "--json", *flags(own))
     return next(row for row in json.loads(done.stdout)["rows"] if row["check"] == "canopen")
-
-
-@contextmanager
-def durand_drive(channel: str, eds: Path) -> Iterator[None]:
-    """A drive on durand as a process of its own; its EDS is there when it listens."""
-    process = subprocess.Popen([sys.executable, "-m", "tests.durand402", channel, str(eds)])
-    try:
-        for _ in range(600):
-            if eds.exists() and eds.read_text(encoding="utf-8"):
-                break
-            process.wait(0.1) if process.poll() is not None else sleep()
-        yield
-    finally:
-        process.terminate()
-        process.wait(10)
-
-
-def sleep() -> None:
-    import time
-
-    time.sleep(0.05)
 
 
 def test_a_drive_on_strangers_stack(configs: Path, settings: Settings, channel: str) -> None:
