@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import hil.guard
 from hil.app import Overrides, Setup, load_setup
+from hil.guard import SAFETY_PARAMS
 from hil.signals import ALL_MISSING, Controlword, DriveState, GuardFlag, Reason, Request, RxFlag, new_ticks
 from hil.supervisor import judge_arming
 from tests.conftest import ROOT
@@ -220,3 +222,13 @@ def test_a_law_at_its_limit_says_so_and_asks_for_what_it_wants() -> None:
     flagged = [row for row in seen if row[0] & int(GuardFlag.SATURATED)]
     assert flagged and all(abs(row[3]) == 15.0 or math.hypot(row[1]) >= 300.0 for row in flagged)
     assert any(abs(row[1]) > 300.0 and abs(row[2]) <= 300.0 for row in flagged), "asked is before the circle"
+
+
+def test_what_is_counted_is_bounded() -> None:
+    """A gap of an hour counts as 1024 periods, whose work a tick can do; there is room for eight slow messages."""
+    guard = Guard()
+    guard.t["gap"] = 3_600_000
+    for _ in range(2):
+        hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
+        assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (1024, 1024)
+    assert SAFETY_PARAMS["age_max"].shape == (hil.guard.MOST_MESSAGES,)
