@@ -225,7 +225,7 @@ def test_a_law_at_its_limit_says_so_and_asks_for_what_it_wants() -> None:
 
 
 def test_what_is_counted_is_bounded() -> None:
-    """A gap of an hour counts as 1024 periods, whose work a tick can do; there is room for eight slow messages."""
+    """A gap of an hour counts as 1024 periods, which a tick can work off; slow messages have eight places."""
     guard = Guard()
     guard.t["gap"] = 3_600_000
     for _ in range(2):
