@@ -22,6 +22,7 @@ from hil.commands import (
     demo,
     emulated,
     faults,
+    identify,
     log,
     paper,
     play,
@@ -58,6 +59,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil compare CONFIG           laws tuned by one optimiser to the same limits, side by side
   hil design CONFIG            windows and poles for a motor, its noise and a wish
   hil config explain KEY       what a config key means: unit, range, default
+  hil identify CONFIG          a motor's parameters with error bars; --from LOG for logged runs
   hil completion bash          completion for the shell; also zsh, tcsh
   hil paper                    everything the paper prints and draws, recomputed
 """
@@ -79,6 +81,7 @@ MODULES = (
     faults,
     campaign,
     tuning,
+    identify,
     config,
 )
 

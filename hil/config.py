@@ -98,6 +98,32 @@ def _includer(base: Path | None) -> Callable[[str], dict[str, Any]]:
     return include
 
 
+class IdentifiedTable(Table):
+    """What ``hil identify`` adds to a motor: from when and what, 95 % intervals by the motor's keys, noise.
+
+    No run reads it.
+    """
+
+    date: str
+    """When it was identified, UTC."""
+    drive: str
+    """On which drive and bus."""
+    logs: list[str] = []
+    """The runs that it was estimated from."""
+    low: dict[str, Finite] = {}
+    """Lower ends of the 95 % intervals, by the motor's keys."""
+    high: dict[str, Finite] = {}
+    """Upper ends of the 95 % intervals, by the motor's keys."""
+    coulomb_n_m: NonNegative | None = None
+    """Coulomb friction."""
+    w_noise_rad_s: NonNegative | None = None
+    """Noise of the measured speed, resolution included, standard deviation."""
+    i_noise_a: NonNegative | None = None
+    """Noise of the measured currents, resolution included, standard deviation."""
+    delay_ticks: Annotated[int, Field(ge=0, le=100)] | None = None
+    """Ticks from sending a voltage to its effect."""
+
+
 class MotorTable(Table):
     """Parameters of a PMSM: what the controller believes. Amplitude-invariant dq, mechanical speed."""
 
@@ -117,6 +143,8 @@ class MotorTable(Table):
     """Moment of inertia J of motor and load together."""
     B_f_n_m_s: NonNegative = 0.0
     """Viscous friction B_f: torque over mechanical speed."""
+    identified: IdentifiedTable | None = None
+    """Where the values come from, when hil identify found them."""
 
 
 class LoopTable(Table):

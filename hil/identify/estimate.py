@@ -22,6 +22,8 @@ MOST_SEGMENTS: Final = 150
 """Of a long log so many segments are taken, evenly spread."""
 TOLD: Final = 0.25
 """Half-width, as a share of the value, from which on a parameter counts as not told."""
+EXACT: Final = 5e-4
+"""Share of R_s, L, psi_f, J to which a model can be believed: the modulator rounds what it is sent."""
 BROKEN: Final = 4.0
 """A segment is left out when its speed is so many times further off than the usual one's."""
 
@@ -181,6 +183,7 @@ def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
     friction = abs(float(found.value[COULOMB])) + abs(float(found.value[B_F])) * fastest
     for name, place in PLACES.items():
         value, half = float(found.value[place]), float(found.half[place])
+        half = math.hypot(half, EXACT * value)
         told = half <= TOLD * abs(value)
         if place in (B_F, COULOMB, LOAD):  # 0 is a value like any other
             told = bool(found.told[place] > 0.5)

@@ -61,9 +61,15 @@ def top_speed(config: RunConfig, motor: MotorTable) -> float:
     return SPEED_SHARE * min(config.limits.w_max_rad_s, by_voltage)
 
 
+def _at_rest(config: RunConfig, passes: float) -> dict[str, Any]:
+    """What both steps without lasting torque share."""
+    most = 0.5 * config.limits.w_max_rad_s
+    return {"passes": passes, "w_most_rad_s": most, "w_wrong_rad_s": most}
+
+
 def sensors(config: RunConfig, motor: MotorTable) -> Step:
     """At rest without voltage: noise, resolution, and whether something drives the shaft."""
-    table = _rows((0, 0, 0, 0, 0.3)) | {"passes": 1.0, "w_most_rad_s": config.limits.w_max_rad_s}
+    table = _rows((0, 0, 0, 0, 0.3)) | _at_rest(config, 1.0)
     return Step("sensors", "no voltage; the shaft stays where it is", table, 0.3)
 
 
@@ -83,14 +89,16 @@ def standstill(config: RunConfig, motor: MotorTable) -> Step | Skipped:
     i_d = min(CURRENT_SHARE * limits.i_max_a, 0.7 * (limits.i_d_max_a or limits.i_max_a))
     most = 0.45 * min(2.0 * config.command.most, config.command.step)
     rows = _pulses(T)
-    table = _rows(*rows) | {
-        "passes": float(PASSES),
-        "u_start_v": most / 1000.0,
-        "u_most_v": most,
-        "i_q_goal_a": 0.8 * CURRENT_SHARE * limits.i_max_a,
-        "i_d_goal_a": i_d,
-        "w_most_rad_s": 0.5 * limits.w_max_rad_s,
-    }
+    table = (
+        _rows(*rows)
+        | _at_rest(config, float(PASSES))
+        | {
+            "u_start_v": most / 1000.0,
+            "u_most_v": most,
+            "i_q_goal_a": 0.8 * CURRENT_SHARE * limits.i_max_a,
+            "i_d_goal_a": i_d,
+        }
+    )
     words = f"voltage pulses up to {i_d:.3g} A along d, short ones along q; the shaft trembles"
     return Step("standstill", words, table, PASSES * sum(row[4] for row in rows))
 

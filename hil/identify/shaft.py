@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
-from hil.identify.data import Samples
+from hil.identify.data import SHORTEST, Samples
 from hil.identify.fit import Shaft
 from hil.identify.model import Flags
 
@@ -48,7 +48,8 @@ def _least_absolute(rows: Array, right: Array) -> Array:
 def _short(samples: Samples, longest: int = 50) -> Samples:
     """The same cut shorter, so that a load that comes for a while leaves pieces as they were."""
     since = np.arange(len(samples)) - np.flatnonzero(samples.begins)[samples.segment]
-    return replace(samples, begins=samples.begins | (since % longest == 0))
+    left = np.bincount(samples.segment)[samples.segment] - since
+    return replace(samples, begins=samples.begins | ((since % longest == 0) & (left >= SHORTEST)))
 
 
 def _solution(samples: Samples, motor: MotorModel) -> tuple[Array, Array]:

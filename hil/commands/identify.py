@@ -1,0 +1,130 @@
+"""``hil identify``: a motor's parameters with error bars, by experiments on the bus or from logs."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import uuid
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
+from hil.outputs import output_file, output_folder
+
+if TYPE_CHECKING:
+    from hil.app import Overrides
+
+
+def register(commands: Commands) -> None:
+    """Add what this module offers."""
+    command = commands.add(
+        "identify", cmd_identify, "Find a motor's parameters with error bars: experiments, or from logs."
+    )
+    command.add_argument("config", type=Path, metavar="CONFIG", nargs="?", help="run configuration (TOML)")
+    command.add_argument("--emulated", action="store_true", help="start the emulated drive of CONFIG, too")
+    command.add_argument("--steps", metavar="A,B", help="of sensors, standstill, spinning, inertia (all)")
+    command.add_argument(
+        "--from",
+        dest="logs",
+        type=Path,
+        nargs="+",
+        metavar="LOG",
+        help="estimate from logged runs; sends nothing",
+    )
+    command.add_argument("--arm", action="store_true", help="allow voltage on a bus that is not emulated")
+    command.add_argument("--yes", action="store_true", help="with --arm: do not ask on the terminal")
+    command.add_argument("--lockstep", action="store_true", help="the emulator advances by one period a SYNC")
+    command.add_argument("-o", "--output", type=Path, metavar="FILE", help="TOML (logs/identify/CONFIG.toml)")
+    bus_flags(command)
+
+
+def cmd_identify(args: argparse.Namespace) -> int:
+    """Identify."""
+    from hil.errors import HilError
+
+    if args.logs and (args.config or args.emulated or args.arm or args.steps):
+        raise HilError("--from re-estimates from logs: it takes no CONFIG, --emulated, --steps or --arm")
+    if not args.logs and args.config is None:
+        raise HilError("hil identify needs a CONFIG, or logs with --from")
+    file = _output(args)
+    result = _from_logs(args, file) if args.logs else _on_the_bus(args, file)
+    if args.json:
+        print_json(result)
+    else:
+        from hil.identify.tables import shown
+        from hil.view import show
+
+        for table in shown(result):
+            show(table)
+        for line in (*result["findings"], *(f"look first: {fault}" for fault in result["faults"])):
+            say(f"hil: {line}")
+    return 0 if result["ok"] else EXIT_FAILED
+
+
+def _output(args: argparse.Namespace) -> Path:
+    """Where the motor goes. Raises HilError before anything is done."""
+    from hil.errors import HilError
+
+    path = args.output
+    if path is None:
+        stem = args.config.stem if args.config else f"{args.logs[0].stem}-motor"
+        path = output_folder(Path("logs/identify")) / f"{stem}.toml"
+    found = output_file(path, ".toml")
+    if args.config and found.resolve() == args.config.resolve():
+        raise HilError(f"{found}: is the configuration itself; name another file")
+    return found
+
+
+def _write(file: Path, text: str) -> str | None:
+    """Write the motor, if there is one."""
+    if not text:
+        return None
+    file.write_text(text, encoding="utf-8")
+    return str(file)
+
+
+def _from_logs(args: argparse.Namespace, file: Path) -> dict[str, Any]:
+    from hil.identify.fromlogs import from_logs
+    from hil.identify.motorfile import toml_of
+
+    result, found, motor, config = from_logs(args.logs)
+    text = toml_of(found, motor, config, result["logs"]) if result["ok"] else ""
+    return result | {"file": _write(file, text)}
+
+
+def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
+    """The experiments, with the emulator of the configuration where that is asked for."""
+    with lean_imports():
+        from hil.app import check_arming, is_emulated_bus, load_setup
+    from hil.arming import confirm
+    from hil.errors import HilError
+    from hil.identify.plan import chosen
+    from hil.identify.session import checked, identify, motor_toml
+
+    names, given = chosen(args.steps), overrides(args)
+    if args.emulated and given.channel is None:
+        given = replace(given, channel=f"identify-{os.getpid()}-{uuid.uuid4().hex[:6]}")
+    setup = load_setup(args.config, given)
+    checked(args.config, setup.config)
+    emulated = is_emulated_bus(setup.config)
+    if args.emulated and not emulated:
+        raise HilError("--emulated: the bus may carry a real drive; take -i hil-local, or leave it out")
+    check_arming(setup, args.arm)
+    if not (args.yes or emulated):
+        confirm(setup.config, sys.stdin, sys.stderr)
+    with _emulator(args, given):
+        session = identify(args.config, setup.config, names, say, arm=args.arm)
+    text = motor_toml(session) if not session.faults else ""
+    return session.as_dict() | {"file": _write(file, text)}
+
+
+def _emulator(args: argparse.Namespace, given: Overrides) -> contextlib.AbstractContextManager[Any]:
+    """The emulator as a process, or nothing."""
+    if not args.emulated:
+        return contextlib.nullcontext()
+    from hil.demo import emulator_process
+
+    return emulator_process(args.config, given)

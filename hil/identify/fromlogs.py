@@ -1,0 +1,101 @@
+"""`hil identify --from`: what runs that are logged already tell of the motor, and whether it drifts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hil.config import MotorTable, RunConfig, validate
+from hil.design import motor_model
+from hil.errors import ConfigError, HilError
+from hil.identify.estimate import Estimate, estimate
+from hil.identify.motorfile import KEYS, motor_of
+from hil.log.parts import grouped
+from hil.log.reader import open_log
+from hil.signals import TickArray
+
+
+@dataclass(frozen=True, slots=True)
+class Logged:
+    """A run from its log: its own configuration, its ticks and what they tell."""
+
+    path: Path
+    started: str
+    config: RunConfig
+    ticks: TickArray
+    found: Estimate
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "log": str(self.path),
+            "started": self.started,
+            "parameters": {name: p.as_dict() for name, p in self.found.parameters.items()},
+            "findings": self.found.findings,
+            "faults": self.found.faults,
+        }
+
+
+def read(paths: tuple[Path, ...]) -> Logged:
+    """Estimate from one run. Raises HilError for a log without what it takes."""
+    log = open_log(paths if len(paths) > 1 else paths[0], frames=False)
+    text = log.attachments.get("config.json")
+    if text is None:
+        raise HilError(f"{paths[0]}: holds no configuration; hil identify needs a run's own log")
+    try:
+        config = validate(json.loads(text), RunConfig, f"{paths[0]}: config.json", None)
+    except ValueError as error:
+        raise HilError(f"{paths[0]}: its configuration can't be read ({error})") from error
+    if log.absent & {"ua_q", "ua_d", "w", "i_q", "i_d"}:
+        raise HilError(f"{paths[0]}: its ticks lack what was measured or applied")
+    found = estimate([log.ticks], 1.0 / config.loop.rate_hz, motor_model(config.motor))
+    return Logged(paths[0], log.metadata.get("run", {}).get("started", ""), config, log.ticks, found)
+
+
+def drift(runs: Sequence[Logged]) -> dict[str, dict[str, Any]]:
+    """How each parameter moves from run to run: its change from first to last, and whether intervals part.
+
+    ``drifts``: some two runs' 95 % intervals, widened by half for being many, do not meet.
+    """
+    out: dict[str, dict[str, Any]] = {}
+    for name in (*KEYS, "coulomb"):
+        found = [run.found.parameters[name] for run in runs if name in run.found.parameters]
+        told = [p for p in found if p.told]
+        if len(told) < 2:
+            continue
+        value, half = np.array([p.value for p in told]), np.array([1.5 * p.half for p in told])
+        apart = float(np.max(value - half) - np.min(value + half))
+        change = float(value[-1] - value[0])
+        share = 100.0 * change / abs(float(value[0])) if value[0] else None
+        out[name] = {"runs": len(told), "change": change, "change_percent": share, "drifts": apart > 0.0}
+    return out
+
+
+def from_logs(paths: Sequence[Path]) -> tuple[dict[str, Any], Estimate, MotorTable, RunConfig]:
+    """All runs together, each by itself, and the drift. Raises HilError."""
+    runs = sorted((read(parts) for parts in grouped(paths)), key=lambda run: run.started)
+    rates, pairs = {run.config.loop.rate_hz for run in runs}, {run.config.motor.n_p for run in runs}
+    if len(rates) > 1 or len(pairs) > 1:
+        raise ConfigError(
+            "--from", ["the runs differ in loop.rate_hz or n_p; they are of no one motor and loop"]
+        )
+    last = runs[-1].config
+    whole = runs[0].found
+    if len(runs) > 1:
+        whole = estimate([run.ticks for run in runs], 1.0 / last.loop.rate_hz, motor_model(last.motor))
+    result = {
+        "parameters": {name: p.as_dict() for name, p in whole.parameters.items()},
+        "logs": [str(run.path) for run in runs],
+        "runs": [run.as_dict() for run in runs],
+        "drift": drift(runs),
+        "findings": whole.findings,
+        "faults": whole.faults,
+        "white": whole.white,
+        "ok": not whole.faults and any(p.told for p in whole.parameters.values()),
+    }
+    return result, whole, motor_of(whole, last.motor), last
