@@ -1,6 +1,6 @@
 """What a case of a campaign costs, beside a case as it was simulated before, and how workers add up.
 
-    python -m benchmarks.campaign [--json] [--cases N] [--full]
+    python -m benchmarks.campaign [--json] [--cases N] [--full] [--motulator PYTHON]
 
 Processor time and ratios of one run, so that other load on the machine matters little:
 
@@ -43,7 +43,7 @@ from hil.shipped import find_config
 from hil.simulate import simulate_ticks
 from hil.view import key_values, show
 
-REPEATS = 40
+REPEATS, CASE_S = 40, 6.0
 PLANT = """[random]
 "plant:motor.J_kg_m2" = { percent = 20 }
 "plant:motor.R_s_ohm" = { percent = 20 }
@@ -94,7 +94,7 @@ def one_case(folder: Path) -> dict[str, float]:
 
     made = [stand.simulation(stand.plan.settings(case), 1)[1] for case in range(REPEATS + 1)]
     case, simulated, designed, before = fastest_ms(stand.run, loop, law.run, as_before)
-    ticks = 6000
+    ticks = round(1000 * CASE_S)
     return {
         "case_ms": case,
         "simulation_ms": simulated,
@@ -141,7 +141,15 @@ def whole(folder: Path, cases: int, workers: int) -> dict[str, float]:
     return found | {"wall_s": wall, "passed": result.passed, "bytes_a_case": size / cases}
 
 
-def measure(cases: int, full: bool) -> dict[str, Any]:
+def beside_motulator(python: str, case_ms: float) -> dict[str, Any]:
+    """motulator's seconds of a core for a simulated second, and how many times ours that is."""
+    found = peer(python, str(HERE / "motulator_drive.py"))
+    if "core_s_a_simulated_s" in found:
+        found["over_a_case_of_ours"] = found["core_s_a_simulated_s"] / (1e-3 * case_ms / CASE_S)
+    return found
+
+
+def measure(cases: int, full: bool, python: str) -> dict[str, Any]:
     """Everything, by name."""
     with tempfile.TemporaryDirectory(prefix="hil-bench-") as name:
         folder = Path(name)
@@ -152,7 +160,7 @@ def measure(cases: int, full: bool) -> dict[str, Any]:
     one, two = (found[f"{cases} cases, workers {n}"]["wall_s"] for n in (1, 2))
     return found | {
         "one worker over two": one / two,
-        "motulator": peer(sys.executable, str(HERE / "motulator_drive.py")),
+        "motulator": beside_motulator(python, found["a case"]["case_ms"]),
     }
 
 
@@ -162,8 +170,11 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--cases", type=int, default=4000)
     parser.add_argument("--full", action="store_true")
+    parser.add_argument(
+        "--motulator", default=sys.executable, metavar="PYTHON", help="an interpreter that has motulator"
+    )
     args = parser.parse_args()
-    found = measure(args.cases, args.full) | {"machine": machine_facts()}
+    found = measure(args.cases, args.full, args.motulator) | {"machine": machine_facts()}
     if args.json:
         sys.stdout.write(json.dumps(found, indent=2) + "\n")
         return

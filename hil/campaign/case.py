@@ -22,6 +22,7 @@ from firmware_model.config import PlantConfig, Wire
 from firmware_model.node import wire_of
 from hil.app import Setup, setup_of
 from hil.campaign.figures import KEYS, Judged
+from hil.campaign.margins import design_margins
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
 from hil.config import RunConfig, override, put, read_toml, validate
 from hil.control.errors import ControlDesignError
@@ -161,7 +162,7 @@ def judged(setup: Setup, simulation: Simulation) -> dict[str, Any]:
         found.feed(ticks)
         if stop is None and ticks["reason"][-1]:
             stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
-    row, machine = found.finish(), simulation.machine
+    row, machine = found.finish() | design_margins(setup), simulation.machine
     end = None if stop is None else explain(machine.safety, machine.safety_state, stop)
     if end is None:
         return row | {"end": None}

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hil.campaign.margins import DESIGN
 from hil.config import LimitsTable, RunConfig
 from hil.report.criteria import FIGURES, check_limit, demanded
 from hil.report.excursions import Excursions
@@ -34,8 +35,8 @@ EXTRA: Final = {
     "i_margin": "share of i_trip that was left",
     "u_margin": "share of u_max that was left",
 }
-KEYS: Final = (*(figure.key for figure in FIGURES), *EXTRA)
-NAMES: Final = {f.key: f"{f.name}{f', {f.unit}' if f.unit else ''}" for f in FIGURES} | EXTRA
+KEYS: Final = (*(figure.key for figure in FIGURES), *EXTRA, *DESIGN)
+NAMES: Final = {f.key: f"{f.name}{f', {f.unit}' if f.unit else ''}" for f in FIGURES} | EXTRA | DESIGN
 
 
 class Columns:

@@ -14,6 +14,7 @@ from hil.campaign import engine, store
 from hil.campaign.case import CaseJob, Stand, job_of
 from hil.campaign.engine import Rate, Workers
 from hil.campaign.figures import KEYS
+from hil.campaign.margins import design_margins
 from hil.campaign.page import page
 from hil.campaign.plan import PlanTable, read_plan
 from hil.campaign.store import Folder, Schema, kind_of
@@ -170,7 +171,9 @@ def campaign(
 def warm(stand: Stand) -> None:
     """Compile every kernel before the workers start: they take them from the cache."""
     with contextlib.suppress(Exception):  # what the base can't, each case says for itself
-        stand.simulation({})[1].warm_up()
+        setup, simulation = stand.simulation({})
+        simulation.warm_up()
+        design_margins(setup)
 
 
 def finish(job: Any, held: Folder, used: Workers, size: int, seen: Seen | None) -> Result:

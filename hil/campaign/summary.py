@@ -23,7 +23,10 @@ from hil.campaign.values import toml
 F8 = npt.NDArray[np.float64]
 SHARES: Final = (0.0, 0.05, 0.5, 0.95, 1.0)
 WORST: Final = 5
-SMALLER_IS_WORSE: Final = ("w_margin", "i_margin", "u_margin")
+SMALLER_IS_WORSE: Final = (
+    *("w_margin", "i_margin", "u_margin"),
+    *("design_gain_margin", "design_phase_margin_deg", "design_delay_margin_ms"),
+)
 LAWS: Final = ("controller.", "observer.")
 FEW: Final = 24
 """At most so many values make a key's axis in the map one of values, not of ranges."""

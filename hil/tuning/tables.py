@@ -48,7 +48,7 @@ def design_table(found: dict[str, Any]) -> Table:
     if verified := found.get("verified"):
         rows["verified"] = (
             f"{'as predicted' if verified['ok'] else 'NOT as predicted'}: dips within "
-            f"{verified['worst_dip_off']:.1%}, noise {verified['noise_off']:+.1%}, bus "
+            f"{verified['worst_dip_off']:.1%}, noise within {verified['worst_noise_off']:.1%}, bus "
             f"{'same to the bit' if verified['bus_same'] else 'differs'}"
         )
     rows |= {"written": found["written"], "front": found["picture"], "took": f"{found['seconds']:.1f} s"}

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import distributed
 import psutil
 import pytest
 
 import hil
 from hil.campaign import store
+from hil.campaign.engine import run_batch
+from hil.campaign.identity import identity, source
+from hil.errors import HilError
 from tests.conftest import CONFIGS, ROOT
 
 pytestmark = [pytest.mark.process, pytest.mark.compiled]
@@ -94,3 +103,60 @@ def test_what_is_done_is_kept_and_gone_on_with_and_workers_end(tmp_path: Path) -
     kept = int(store.open_folder(folder).done().sum())
     assert 0 < kept < CASES
     assert hil.campaign(path, folder, workers=0, resume=True).cases == CASES
+
+
+def settled(*words: str) -> tuple[int, str, str]:
+    process = started(*words)
+    out, err = process.communicate(timeout=280)
+    return process.returncode, out, err
+
+
+@contextlib.contextmanager
+def dask(*words: str, **more: Any) -> Iterator[None]:
+    """A process of Dask's own command line for as long as the block runs."""
+    command = [sys.executable, "-m", "distributed.cli." + words[0], *words[1:], "--no-dashboard"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, **more)
+    try:
+        yield
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+@contextlib.contextmanager
+def joined(address: str) -> Iterator[None]:
+    """The block begins once a worker is there."""
+    with distributed.Client(address) as client:  # type: ignore[no-untyped-call]
+        client.wait_for_workers(1)
+    yield
+
+
+def test_a_worker_of_another_version_is_refused_by_name_and_an_equal_one_taken(tmp_path: Path) -> None:
+    """The other one's sources differ in a comment: two states may have one version."""
+    other, known = tmp_path / "other", tmp_path / "scheduler.json"
+    for package in ("hil", "drivers", "firmware_model"):
+        shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("__pycache__"))
+    with (other / "hil" / "guard.py").open("a") as file:
+        file.write("# changed\n")
+    path, env = plan_file(tmp_path), {**os.environ, "PYTHONPATH": str(other)}
+    file_of = ("--scheduler-file", str(known))
+    with dask("dask_scheduler", "--host", "127.0.0.1", "--port", "0", *file_of):
+        for _ in until("the scheduler's address"):
+            if known.exists() and known.read_text():
+                break
+        address = json.loads(known.read_text())["address"]
+        words = (str(path), "--scheduler", address, "-o")
+        worker = ("dask_worker", *file_of, "--nthreads", "1", "--host", "127.0.0.1")
+        with dask(*worker, cwd=other, env=env), joined(address):
+            code, out, err = settled(*words, str(tmp_path / "refused"))
+        assert (code, out) == (2, "")
+        told = rf"hil: worker tcp://\S+ has source \w{{12}} and not {source()}; install the same on all\n"
+        assert re.fullmatch(told, err), err
+        with dask(*worker, cwd=ROOT), joined(address):
+            code, out, err = settled(*words, str(tmp_path / "taken"), "--json")
+    assert code == 0 and json.loads(out)["cases"] == CASES, err
+
+
+def test_a_worker_of_another_version_that_comes_later_runs_nothing() -> None:
+    with pytest.raises(HilError, match=r"a worker has numpy .* and not 0; install the same on all"):
+        run_batch(None, {**identity(), "numpy": "0"}, 0, 1)  # type: ignore[arg-type]

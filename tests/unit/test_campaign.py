@@ -14,12 +14,16 @@ import hil
 from hil.app import Overrides, load_setup
 from hil.campaign import store
 from hil.campaign.case import job_of
+from hil.campaign.margins import DESIGN, design_margins
 from hil.campaign.plan import Plan, read_plan
 from hil.campaign.values import distribution, toml
 from hil.cli import main
 from hil.report.build import build
 from hil.report.criteria import figures
 from hil.simulate import simulate
+from hil.tuning.bench import bench_of
+from hil.tuning.loop import rigid
+from hil.tuning.measure import margins
 from tests.conftest import CONFIGS
 
 SHORT = 'set = ["loop.duration_s=0.6", "reference.at_s=0.05"]\nplant_set = ["load.0.at_s=0.3"]\n'
@@ -213,6 +217,36 @@ def test_figures_are_those_of_the_report_over_the_log_of_the_same_run(tmp_path: 
         if value is not None:
             assert row[key] == pytest.approx(value, rel=1e-6), key
     assert row["passed"] and row["criteria:dip_rad_s"] == "pass"
+
+
+def test_margins_are_those_of_the_design_whatever_the_plant_is(tmp_path: Path) -> None:
+    text = f'[grid]\n"controller.speed_pole_rad_s" = [20.0, 60.0]\n{J} = [0.011, 0.013]\n'
+    path = plan_file(tmp_path, text + '"controller.current_pole_rad_s" = [250.0]\n')
+    rows = hil.campaign(path, tmp_path / "out").rows()
+    by_law: dict[Any, set[Any]] = {}
+    for row in rows:
+        by_law.setdefault(row["controller.speed_pole_rad_s"], set()).add(tuple(row[key] for key in DESIGN))
+    slow, fast = by_law[20.0], by_law[60.0]
+    assert len(slow) == len(fast) == 1 and len(rows) == 4
+    (one,), (other,) = slow, fast
+    poles = ("controller.speed_pole_rad_s=20.0", "controller.current_pole_rad_s=250.0")
+    setup = load_setup(CONFIGS / "demo.toml", Overrides(settings=poles))
+    bench = bench_of(CONFIGS / "demo.toml", setup)
+    wanted = margins(setup.machine.law, bench, rigid(bench.motor, bench.T_s))
+    assert one[1:] == pytest.approx(tuple(wanted.values()), rel=1e-12)
+    assert 1.0 < one[0] < other[0] and all(a > b > 0 for a, b in zip(one[1:], other[1:], strict=True))
+
+
+UNSTABLE = """controller={kind="pi", speed_gain_as_rad=0.39, speed_integral_a_rad=15.0,
+current_gain_v_a=200.0, current_integral_v_as=674.0}""".replace("\n", " ")
+
+
+@pytest.mark.parametrize(("config", "settings"), [("paper", ()), ("demo", (UNSTABLE,))])
+def test_a_law_that_commands_the_load_or_is_unstable_has_no_margins(
+    config: str, settings: tuple[str, ...]
+) -> None:
+    setup = load_setup(CONFIGS / f"{config}.toml", Overrides(settings=settings))
+    assert design_margins(setup) == dict.fromkeys(DESIGN)
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path) -> None:

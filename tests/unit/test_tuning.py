@@ -23,6 +23,7 @@ from hil.tuning.families import FAMILIES, family, settings_of, toml
 from hil.tuning.loop import rigid, shaft
 from hil.tuning.measure import Bench, judge, loops, margins, quiet
 from hil.tuning.optimise import Limits, law_of, spec_of, tune
+from hil.tuning.verify import verdict, verify
 from hil.tuning.windows import figures
 from tests.conftest import CONFIGS
 
@@ -222,3 +223,22 @@ def test_what_the_shipped_configs_promise() -> None:
     assert all(quiet(demo.machine.law, BENCH, plants, 3.0))
     rigid_one = load_setup(CONFIGS / "rigid.toml", Overrides())
     assert seen_in(simulate_ticks(rigid_one), 1e-3).dip < 2.3
+
+
+@pytest.mark.process
+def test_a_design_is_verified_in_simulation_and_on_the_bus(tmp_path: Path) -> None:
+    """Of the 18 plants the two that need no corner; the corners differ from them by a setting."""
+    rigid_motor: dict[str, float] = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.0)
+    tables = {
+        "controller": {"kind": "cascade", "speed_pole_rad_s": 105.0, "current_pole_rad_s": 480.0},
+        "speed": {"kind": "cubic", "delay_ms": 19.0},
+        "current": {"kind": "cubic", "delay_ms": 25.0},
+    }
+    settings = ("loop.duration_s=4.0", f'log.folder="{tmp_path}"')
+    law, seen = law_of(tables, SPEC, 1e-3), list[int]()
+    found = verify(DEMO, Overrides(settings=settings), tables, {}, rigid_motor, law, seen.append)
+    file, believed = found["rows"]
+    assert found["ok"] and found["bus_same"] and seen == [1, 2] and "dip_off" not in file
+    assert abs(believed["dip_off"]) <= 0.05 and abs(believed["u_noise_off"]) <= 0.15
+    for key, value in (("dip_off", -0.06), ("u_noise_off", 0.16), ("bus_same", False)):
+        assert not verdict([file, believed, {**believed, key: value}])["ok"]
