@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from hil.app import Setup
-from hil.control.law import FAC, LAW_PARAMS, MotorModel
+from hil.control.law import CASCADE, LAW_PARAMS, PI, MotorModel
 from hil.design import motor_model
 from hil.tuning.loop import rigid
 from hil.tuning.measure import Bench, loops, margins
@@ -25,9 +25,12 @@ DESIGN: Final = {
     "design_delay_margin_ms": "delay margin, with the motor that the law believes in, ms",
 }
 
+VOLTAGE: Final = (CASCADE, PI)
+"""Codes of the laws that ask a drive for a voltage: what the linear loop is made of."""
+
 
 def design_margins(setup: Setup) -> dict[str, float | None]:
-    """Columns of :data:`DESIGN`; None for a law that commands the load, or that is not stable there."""
+    """Columns of :data:`DESIGN`; None for a law that asks for anything but a voltage, or is unstable."""
     return _margins(
         setup.machine.law.tobytes(), motor_model(setup.config.motor), 1.0 / setup.config.loop.rate_hz
     )
@@ -37,7 +40,7 @@ def design_margins(setup: Setup) -> dict[str, float | None]:
 def _margins(params: bytes, motor: MotorModel, T_s: float) -> dict[str, float | None]:
     law = np.frombuffer(params, LAW_PARAMS)
     bench, plant = Bench(motor, T_s, 1.0, 0.0, 0.0), rigid(motor, T_s)
-    if law["kind"][0] == FAC or not (loop := loops(law, bench, [plant])[0]).stable:
+    if law["kind"][0] not in VOLTAGE or not (loop := loops(law, bench, [plant])[0]).stable:
         return dict.fromkeys(DESIGN)
     values = (loop.ms, *margins(law, bench, plant).values())
     return {key: value if math.isfinite(value) else None for key, value in zip(DESIGN, values, strict=True)}

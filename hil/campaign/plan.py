@@ -21,6 +21,7 @@ import numpy.typing as npt
 from pydantic import Field
 from scipy.stats import qmc
 
+from hil.campaign.normal import normal, root
 from hil.campaign.values import FORMS, NAMES, Distribution, corners, distribution, number
 from hil.config import Table, read_toml, validate
 from hil.errors import ConfigError
@@ -93,10 +94,9 @@ class Correlated:
 
     def at(self, u: F8) -> Settings:
         """The values for one row of uniforms, one for each key."""
-        from scipy.special import ndtri
-
-        values = np.array(self.mean) + np.array(self.root) @ ndtri(u)
-        return dict(zip(self.keys, map(float, values), strict=True))
+        z = [normal(x) for x in u.tolist()]
+        spread = (math.fsum(a * b for a, b in zip(row, z, strict=True)) for row in self.root)
+        return {key: mean + more for key, mean, more in zip(self.keys, self.mean, spread, strict=True)}
 
 
 @dataclass(frozen=True)
@@ -328,7 +328,7 @@ class Builder:
 
 
 def _root(group: CovarianceTable, means: int) -> tuple[tuple[float, ...], ...]:
-    """A root of a covariance: eigenvectors times the roots of the eigenvalues. Raises ValueError."""
+    """A root of a covariance: that of the correlations, times the standard deviations. Raises ValueError."""
     size = len(group.keys)
     if means != size or [len(row) for row in group.covariance] != [size] * size:
         raise ValueError(f"{size} keys need as many means and a square matrix of that size")
@@ -338,11 +338,8 @@ def _root(group: CovarianceTable, means: int) -> tuple[tuple[float, ...], ...]:
     scale = np.sqrt(np.diag(matrix)) if (np.diag(matrix) > 0).all() else None
     if scale is None:
         raise ValueError("its diagonal, the variances, must be above 0")
-    values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-    if values.min() < -1e-9:
-        raise ValueError("no covariance can be that: a correlation beyond 1, or several that contradict")
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return tuple(tuple(float(v) for v in row) for row in root)
+    rows = root((matrix / np.outer(scale, scale)).tolist())
+    return tuple(tuple(size * x for x in row) for size, row in zip(scale.tolist(), rows, strict=True))
 
 
 def _values(given: Any) -> tuple[Any, ...]:

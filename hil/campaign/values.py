@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from scipy.special import ndtri
+from hil.campaign.normal import between, normal
 
 Kind = Literal["uniform", "loguniform", "normal", "integers", "choice"]
 NAMES: Final[dict[str, Kind]] = {
@@ -48,9 +48,9 @@ class Distribution:
             return self.values[min(int(u * len(self.values)), len(self.values) - 1)]
         a, b = self.values
         if self.kind == "normal":
-            return float(a + b * ndtri(u))
+            return float(a + b * normal(u))
         if self.kind == "loguniform":
-            return float(math.exp(math.log(a) + u * (math.log(b) - math.log(a))))
+            return between(a, b, u)
         if self.kind == "integers":
             return min(int(a + u * (b - a + 1)), int(b))
         return float(a + u * (b - a))

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil.app import Overrides, Setup, load_setup
-from hil.control.law import FAC
+from hil.control.law import CASCADE, FAC, PI
 from hil.design import motor_model
 from hil.emulate import load_plant
 from hil.errors import HilError
@@ -24,10 +24,16 @@ QUIET_S: Final = 0.5
 
 
 def speed_drive(path: Path, overrides: Overrides) -> Setup:
-    """The setup of a drive under speed control. Raises HilError for a law that commands the load."""
+    """The setup of a drive under speed control by voltages. Raises HilError for any other law."""
     setup = load_setup(path, overrides)
-    if int(setup.machine.law["kind"][0]) == FAC:
+    kind = int(setup.machine.law["kind"][0])
+    if kind == FAC:
         raise HilError(f"{path}: controller.kind fac commands the load; only speed drives can be tuned")
+    if kind not in (CASCADE, PI):
+        raise HilError(
+            f"{path}: controller.kind {setup.config.controller.kind} asks for no voltage; only laws that do "
+            "can be tuned"
+        )
     return setup
 
 

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import ndtri
 
 import hil
 from hil.app import Overrides, load_setup
 from hil.campaign import store
 from hil.campaign.case import job_of
 from hil.campaign.margins import DESIGN, design_margins
+from hil.campaign.normal import between, normal, root
 from hil.campaign.plan import Plan, read_plan
 from hil.campaign.values import distribution, toml
 from hil.cli import main
@@ -122,6 +124,25 @@ def test_a_normal_distribution_is_one() -> None:
         assert found.at(0.5) == 5.0 and found.at(0.8413447460685429) == pytest.approx(7.0)
     assert [distribution({"choice": ["a", "b"]}, None).at(u) for u in (0.1, 0.6)] == ["a", "b"]
     assert {distribution({"integers": [2, 4]}, None).at(u) for u in (0.01, 0.5, 0.99)} == {2, 3, 4}
+
+
+def test_draws_without_libm_are_those_of_the_libraries() -> None:
+    shares = np.random.default_rng(3).random(3000) ** np.arange(1, 4).repeat(1000) * (1 - 1e-15)
+    for u in [*shares.tolist(), *(1 - shares).tolist(), 1e-300, 1e-12, 0.075, 0.925, 1 - 1e-16]:
+        assert normal(u) == pytest.approx(float(ndtri(u)), rel=3e-15, abs=1e-16)
+        assert between(1e-3, 50.0, u) == pytest.approx(1e-3 * 5e4**u, rel=1e-14)
+    assert normal(0.5) == 0.0 and normal(0.25) == -normal(0.75)
+    assert between(2.0, 8.0, 0.5) == 4.0 and between(0.1, 7.0, 0.0) == 0.1
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3, 4])
+def test_the_root_of_a_correlation_is_one_also_when_it_is_singular(rank: int) -> None:
+    factors = np.random.default_rng(rank).normal(size=(4, rank))
+    factors /= np.linalg.norm(factors, axis=1)[:, None]
+    wanted = factors @ factors.T
+    found = np.array(root(wanted.tolist()))
+    np.testing.assert_allclose(found @ found.T, wanted, atol=1e-7)
+    assert (np.triu(found, 1) == 0).all() and (np.diag(found) >= 0).all()
 
 
 @pytest.mark.parametrize("table", ["random", "lhs", "sobol"])
@@ -241,8 +262,8 @@ UNSTABLE = """controller={kind="pi", speed_gain_as_rad=0.39, speed_integral_a_ra
 current_gain_v_a=200.0, current_integral_v_as=674.0}""".replace("\n", " ")
 
 
-@pytest.mark.parametrize(("config", "settings"), [("paper", ()), ("demo", (UNSTABLE,))])
-def test_a_law_that_commands_the_load_or_is_unstable_has_no_margins(
+@pytest.mark.parametrize(("config", "settings"), [("paper", ()), ("current", ()), ("demo", (UNSTABLE,))])
+def test_a_law_that_asks_for_no_voltage_or_is_unstable_has_no_margins(
     config: str, settings: tuple[str, ...]
 ) -> None:
     setup = load_setup(CONFIGS / f"{config}.toml", Overrides(settings=settings))

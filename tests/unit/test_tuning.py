@@ -193,9 +193,14 @@ def test_designs_that_can_not_be_are_refused(
     assert not (tmp_path / "x.toml").exists()
 
 
-def test_fac_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["compare", str(CONFIGS / "paper.toml"), "--laws", "pi", "-o", str(tmp_path)]) == 2
-    assert "only speed drives" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("config", "said"), [("paper", "only speed drives"), ("current", "asks for no voltage")]
+)
+def test_what_asks_for_no_voltage_is_refused(
+    config: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["compare", str(CONFIGS / f"{config}.toml"), "--laws", "pi", "-o", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
 
 
 def bench(**more: Any) -> Bench:
