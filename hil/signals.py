@@ -131,8 +131,30 @@ class GuardFlag(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Shown:
+    """Where people see a field. Report, watch and ``hil replay --config`` draw and compare what stands here.
+
+    ``plot``: key of a report's plot; a key that is not in :mod:`hil.report.curves` is a plot of its own.
+    ``label``: what legends call it; ``place``: its order there. ``compared``: drawn where several runs are.
+    ``until_stop``: means nothing once the run stops. ``live``: its plot in ``hil watch --web``.
+    ``what_if``: compared between the logged and another controller.
+    """
+
+    plot: str = ""
+    label: str = ""
+    place: int = 0
+    compared: bool = True
+    until_stop: bool = False
+    live: str = ""
+    what_if: bool = False
+
+
+HIDDEN: Final = Shown()
+
+
+@dataclass(frozen=True, slots=True)
 class Field:
-    """One field of the tick record: protobuf number, name, kind, unit, role and meaning."""
+    """One field of the tick record: protobuf number, name, kind, unit, role, meaning, where it is shown."""
 
     number: int
     name: str
@@ -142,107 +164,104 @@ class Field:
     doc: str
     absent: float | None = None
     """Of an input newer than log format 1: what a log without it stands for (docs/log-format.md)."""
+    shown: Shown = HIDDEN
+
+    @property
+    def scale(self) -> float:
+        """Factor to the unit in which it is drawn: times in us."""
+        return 1e-3 if self.unit == "ns" else 1.0
+
+    @property
+    def drawn_unit(self) -> str:
+        """Unit in which it is drawn."""
+        return "us" if self.unit == "ns" else self.unit
 
 
 FIELDS: Final[tuple[Field, ...]] = (
     Field(1, "k", "u8", "", "time", "tick index"),
     Field(2, "t_ns", "i8", "ns", "time", "deadline of the tick on the loop's clock"),
-    Field(3, "lateness_ns", "i4", "ns", "time", "wake-up after the deadline"),
-    Field(
-        4,
-        "received_ns",
-        "i4",
-        "ns",
-        "time",
-        "newest feedback taken, after the deadline; paced by the timer it may be negative: its age",
-    ),
-    Field(5, "computed_ns", "i4", "ns", "time", "control law done, after the deadline"),
-    Field(6, "sent_ns", "i4", "ns", "time", "command handed to the bus, after the deadline"),
-    Field(7, "skipped", "u4", "", "time", "whole periods skipped before this tick"),
+    Field(3, "lateness_ns", "i4", "ns", "time", "wake-up after the deadline",
+          shown=Shown("lateness", "woken", 3, until_stop=True, live="lateness")),
+    Field(4, "received_ns", "i4", "ns", "time",
+          "newest feedback taken, after the deadline; paced by the timer it may be negative: its age",
+          shown=Shown("lateness", "received", 2, False, True)),
+    Field(5, "computed_ns", "i4", "ns", "time", "control law done, after the deadline",
+          shown=Shown("lateness", "computed", 1, False, True)),
+    Field(6, "sent_ns", "i4", "ns", "time", "command handed to the bus, after the deadline",
+          shown=Shown("lateness", "sent", 0, False, True)),
+    Field(7, "skipped", "u4", "", "time", "whole periods skipped before this tick",
+          shown=Shown("bus", "skipped")),
     Field(8, "recorded_ns", "i4", "ns", "time", "previous tick's record stored, after that tick's deadline"),
-    Field(
-        9,
-        "check",
-        "u8",
-        "",
-        "check",
-        "sum over the other fields when the record was written (docs/log-format.md)",
-    ),
+    Field(9, "check", "u8", "", "check",
+          "sum over the other fields when the record was written (docs/log-format.md)"),
     Field(16, "rx_flags", "u4", "", "input", "RxFlag bits"),
     Field(17, "gap", "u4", "", "input", "periods since the previous tick (1 unless periods were skipped)"),
-    Field(18, "w", "f8", "rad/s", "input", "measured mechanical speed"),
-    Field(19, "i_q", "f8", "A", "input", "measured q current"),
-    Field(20, "i_d", "f8", "A", "input", "measured d current"),
+    Field(18, "w", "f8", "rad/s", "input", "measured mechanical speed",
+          shown=Shown("speed", "w", 1, live="speed")),
+    Field(19, "i_q", "f8", "A", "input", "measured q current",
+          shown=Shown("current", "i_q", 1, live="current")),
+    Field(20, "i_d", "f8", "A", "input", "measured d current",
+          shown=Shown("current", "i_d", 2, False, live="current")),
     Field(21, "echo", "u4", "", "input", "counter of the command the drive applies from now on"),
-    Field(22, "drive_state", "u4", "", "input", "DriveState of the drive"),
+    Field(22, "drive_state", "u4", "", "input", "DriveState of the drive",
+          shown=Shown("state", "drive", 1, False)),
     Field(23, "limited", "u4", "", "input", "1 when the drive limited the voltage"),
-    Field(24, "v_dc", "f8", "V", "input", "DC-link voltage of the newest status frame, NaN before it"),
-    Field(25, "temperature_motor", "f8", "degC", "input", "motor temperature of the newest status frame"),
-    Field(26, "temperature_inverter", "f8", "degC", "input", "inverter temperature, newest status frame"),
+    Field(24, "v_dc", "f8", "V", "input", "DC-link voltage of the newest status frame, NaN before it",
+          shown=Shown("v_dc", "v_dc")),
+    Field(25, "temperature_motor", "f8", "degC", "input", "motor temperature of the newest status frame",
+          shown=Shown("temperature", "motor")),
+    Field(26, "temperature_inverter", "f8", "degC", "input", "inverter temperature, newest status frame",
+          shown=Shown("temperature", "inverter", 1, False)),
     Field(27, "drive_error", "u4", "", "input", "CiA 301/402 error code of the drive, 0 for none"),
-    Field(28, "w_ref", "f8", "rad/s", "input", "reference speed"),
+    Field(28, "w_ref", "f8", "rad/s", "input", "reference speed", shown=Shown("speed", "w*", live="speed")),
     Field(29, "dw_ref", "f8", "rad/s2", "input", "its derivative"),
     Field(30, "request", "u4", "", "input", "Request of the operator"),
     Field(31, "log_failed", "u4", "", "input", "1 when the writer reported a failure"),
-    Field(32, "T_L_true", "f8", "N m", "input", "true load torque when the drive is an emulator, else NaN"),
+    Field(32, "T_L_true", "f8", "N m", "input", "true load torque when the drive is an emulator, else NaN",
+          shown=Shown("load", "true", live="load torque")),
     Field(33, "i_q_ref_in", "f8", "A", "input", "reference q current (controller fac), else 0"),
-    Field(
-        34,
-        "u_q_seen",
-        "f8",
-        "V",
-        "input",
-        "shadow run: q voltage of the other controller, applied from now on",
-    ),
-    Field(
-        35,
-        "u_d_seen",
-        "f8",
-        "V",
-        "input",
-        "shadow run: d voltage of the other controller, applied from now on",
-    ),
-    Field(
-        36,
-        "missing",
-        "u4",
-        "",
-        "input",
-        "bit i: the i-th slow message of the drive's map has not come since the previous tick",
-        absent=0,
-    ),
-    Field(48, "state", "u4", "", "output", "DriveState of the supervisor"),
+    Field(34, "u_q_seen", "f8", "V", "input",
+          "shadow run: q voltage of the other controller, applied from now on"),
+    Field(35, "u_d_seen", "f8", "V", "input",
+          "shadow run: d voltage of the other controller, applied from now on"),
+    Field(36, "missing", "u4", "", "input",
+          "bit i: the i-th slow message of the drive's map has not come since the previous tick",
+          absent=0),
+    Field(48, "state", "u4", "", "output", "DriveState of the supervisor",
+          shown=Shown("state", "supervisor")),
     Field(49, "reason", "u4", "", "output", "Reason that latched, 0 while none"),
     Field(50, "guard_flags", "u4", "", "output", "GuardFlag bits"),
     Field(51, "controlword", "u4", "", "output", "CiA 402 controlword sent"),
     Field(52, "counter", "u4", "", "output", "counter of the command sent"),
-    Field(
-        53,
-        "send",
-        "u4",
-        "",
-        "output",
-        "1 when a command goes out this tick; an event says when the bus refused it",
-    ),
-    Field(54, "filled", "u4", "", "output", "observer memory filled with measurements, ticks"),
-    Field(55, "ua_q", "f8", "V", "output", "q voltage applied over the past period"),
-    Field(56, "ua_d", "f8", "V", "output", "d voltage applied over the past period"),
-    Field(57, "d_hat_w", "f8", "rad/s2", "output", "estimated disturbance of the speed channel"),
-    Field(58, "d_hat_q", "f8", "A/s", "output", "estimated disturbance of the q current channel"),
-    Field(59, "d_hat_d", "f8", "A/s", "output", "estimated disturbance of the d current channel"),
-    Field(60, "i_q_ref", "f8", "A", "output", "q current asked by the speed law, after its limit"),
-    Field(
-        61, "u_q_law", "f8", "V", "output", "q voltage asked by the control law, before the voltage circle"
-    ),
-    Field(
-        62, "u_d_law", "f8", "V", "output", "d voltage asked by the control law, before the voltage circle"
-    ),
+    Field(53, "send", "u4", "", "output",
+          "1 when a command goes out this tick; an event says when the bus refused it"),
+    Field(54, "filled", "u4", "", "output", "observer memory filled with measurements, ticks",
+          shown=Shown("filled", "filled")),
+    Field(55, "ua_q", "f8", "V", "output", "q voltage applied over the past period",
+          shown=Shown("voltage_q", "applied", 2)),
+    Field(56, "ua_d", "f8", "V", "output", "d voltage applied over the past period",
+          shown=Shown("voltage_d", "applied", 2)),
+    Field(57, "d_hat_w", "f8", "rad/s2", "output", "estimated disturbance of the speed channel",
+          shown=Shown("d_w", "d_hat_w", until_stop=True, what_if=True)),
+    Field(58, "d_hat_q", "f8", "A/s", "output", "estimated disturbance of the q current channel",
+          shown=Shown("d_i", "d_hat_q", until_stop=True, what_if=True)),
+    Field(59, "d_hat_d", "f8", "A/s", "output", "estimated disturbance of the d current channel",
+          shown=Shown("d_i", "d_hat_d", 1, False, True, what_if=True)),
+    Field(60, "i_q_ref", "f8", "A", "output", "q current asked by the speed law, after its limit",
+          shown=Shown("current", "i_q*", 0, False, live="current", what_if=True)),
+    Field(61, "u_q_law", "f8", "V", "output", "q voltage asked by the control law, before the voltage circle",
+          shown=Shown("voltage_q", "asked", 0, False, what_if=True)),
+    Field(62, "u_d_law", "f8", "V", "output", "d voltage asked by the control law, before the voltage circle",
+          shown=Shown("voltage_d", "asked", 0, False, what_if=True)),
     Field(63, "T_L_law", "f8", "N m", "output", "load torque asked by the control law (fac), else 0"),
-    Field(64, "u_q", "f8", "V", "output", "q voltage sent: guarded and rounded to the wire"),
-    Field(65, "u_d", "f8", "V", "output", "d voltage sent"),
+    Field(64, "u_q", "f8", "V", "output", "q voltage sent: guarded and rounded to the wire",
+          shown=Shown("voltage_q", "sent", 1, False, live="command")),
+    Field(65, "u_d", "f8", "V", "output", "d voltage sent",
+          shown=Shown("voltage_d", "sent", 1, False, live="command")),
     Field(66, "T_L", "f8", "N m", "output", "load torque sent (fac), else 0"),
-    Field(67, "T_L_hat", "f8", "N m", "output", "load torque estimate -J d_hat_w"),
-)
+    Field(67, "T_L_hat", "f8", "N m", "output", "load torque estimate -J d_hat_w",
+          shown=Shown("load", "estimate", 1, until_stop=True, live="load torque", what_if=True)),
+)  # fmt: skip
 
 
 def tag(number: int, kind: Kind) -> bytes:

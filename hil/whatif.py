@@ -28,8 +28,8 @@ from hil.log.split import STATE
 from hil.replay import machine_of, refold, set_inputs, state_text, tick_blocks, wire_of_log
 from hil.signals import FIELDS, DriveState, TickArray, new_ticks
 
-COMPARED: Final = ("d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "i_q_ref", "u_q_law", "u_d_law")
-"""What is compared: the estimates, then what the law asks for before the guard."""
+COMPARED: Final = tuple(field.name for field in FIELDS if field.shown.what_if)
+"""What is compared: the estimates, and what the law asks for before the guard."""
 UNITS: Final = {f.name: f.unit for f in FIELDS}
 
 

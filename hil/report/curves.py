@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.config import RunConfig
-from hil.signals import DriveState, RxFlag, TickArray
+from hil.signals import FIELDS, DriveState, Field, RxFlag, TickArray
 
 F8 = npt.NDArray[np.float64]
 F4 = npt.NDArray[np.float32]
@@ -34,13 +34,9 @@ class Plot:
     key: str
     title: str
     unit: str
-    curves: tuple[Curve, ...]
+    curves: tuple[Curve, ...] = ()
     held: bool = False
     names: tuple[str, ...] = ()
-
-
-def _field(name: str, scale: float = 1.0) -> Callable[[TickArray], Any]:
-    return lambda ticks: ticks[name] * scale
 
 
 def _error(ticks: TickArray) -> Any:
@@ -54,66 +50,57 @@ def _lost(ticks: TickArray) -> Any:
     return (ticks["rx_flags"] & int(RxFlag.FRESH)) == 0
 
 
-def _until_stop(name: str, label: str, compared: bool = True, scale: float = 1.0) -> Curve:
-    """What means nothing once the run stops, and would then set the scale: estimates, times in a tick."""
+def _curve(field: Field) -> Curve:
+    """A field as its row in :data:`hil.signals.FIELDS` says."""
+    name, scale, shown = field.name, field.scale, field.shown
 
     def of(ticks: TickArray) -> Any:
-        return np.where(ticks["reason"] == 0, ticks[name] * scale, np.nan)
+        values = ticks[name] * scale
+        return np.where(ticks["reason"] == 0, values, np.nan) if shown.until_stop else values
 
-    return Curve(name, label, of, compared)
-
-
-def _curve(name: str, label: str, compared: bool = True, scale: float = 1.0) -> Curve:
-    return Curve(name, label, _field(name, scale), compared)
+    return Curve(name, shown.label, of, shown.compared)
 
 
-PLOTS: Final = (
-    Plot("speed", "Speed and reference", "rad/s", (_curve("w_ref", "w*"), _curve("w", "w"))),
-    Plot("error", "Speed error in operation", "rad/s", (Curve("error", "w − w*", _error),)),
-    Plot(
-        "current", "Currents", "A",
-        (_curve("i_q_ref", "i_q*", False), _curve("i_q", "i_q"), _curve("i_d", "i_d", False)),
-    ),
-    Plot(
-        "voltage_q", "q voltage: asked by the law, sent, applied", "V",
-        (_curve("u_q_law", "asked", False), _curve("u_q", "sent", False), _curve("ua_q", "applied")), True,
-    ),
-    Plot(
-        "voltage_d", "d voltage: asked by the law, sent, applied", "V",
-        (_curve("u_d_law", "asked", False), _curve("u_d", "sent", False), _curve("ua_d", "applied")), True,
-    ),
-    Plot(
-        "load", "Load torque: true and estimated", "N m",
-        (_curve("T_L_true", "true"), _until_stop("T_L_hat", "estimate")),
-    ),
-    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²", (_until_stop("d_hat_w", "d_hat_w"),)),
-    Plot(
-        "d_i", "Disturbance estimates, current channels", "A/s",
-        (_until_stop("d_hat_q", "d_hat_q"), _until_stop("d_hat_d", "d_hat_d", False)),
-    ),
-    Plot("filled", "Observer memory filled", "ticks", (_curve("filled", "filled"),), True),
-    Plot(
-        "state", "States", "",
-        (_curve("state", "supervisor"), _curve("drive_state", "drive", False)), True, STATE_NAMES,
-    ),
-    Plot(
-        "lateness", "After the deadline of the tick", "µs",
-        (
-            _until_stop("sent_ns", "sent", False, 1e-3), _until_stop("computed_ns", "computed", False, 1e-3),
-            _until_stop("received_ns", "received", False, 1e-3),
-            _until_stop("lateness_ns", "woken", True, 1e-3),
-        ),
-    ),
-    Plot(
-        "bus", "Periods skipped; ticks without fresh feedback", "",
-        (_curve("skipped", "skipped"), Curve("lost", "no feedback", _lost)), True,
-    ),
-    Plot("v_dc", "DC-link voltage", "V", (_curve("v_dc", "v_dc"),)),
-    Plot(
-        "temperature", "Temperatures", "°C",
-        (_curve("temperature_motor", "motor"), _curve("temperature_inverter", "inverter", False)),
-    ),
-)  # fmt: skip
+DERIVED: Final = {"error": (Curve("error", "w − w*", _error),), "bus": (Curve("lost", "no feedback", _lost),)}
+"""Curves that are no field, by plot; they stand behind its fields."""
+HEADS: Final = (
+    Plot("speed", "Speed and reference", "rad/s"),
+    Plot("error", "Speed error in operation", "rad/s"),
+    Plot("current", "Currents", "A"),
+    Plot("voltage_q", "q voltage: asked by the law, sent, applied", "V", held=True),
+    Plot("voltage_d", "d voltage: asked by the law, sent, applied", "V", held=True),
+    Plot("load", "Load torque: true and estimated", "N m"),
+    Plot("d_w", "Disturbance estimate, speed channel", "rad/s²"),
+    Plot("d_i", "Disturbance estimates, current channels", "A/s"),
+    Plot("filled", "Observer memory filled", "ticks", held=True),
+    Plot("state", "States", "", held=True, names=STATE_NAMES),
+    Plot("lateness", "After the deadline of the tick", "µs"),
+    Plot("bus", "Periods skipped; ticks without fresh feedback", "", held=True),
+    Plot("v_dc", "DC-link voltage", "V"),
+    Plot("temperature", "Temperatures", "°C"),
+)
+
+
+def plots_by_field(fields: Sequence[Field]) -> tuple[Plot, ...]:
+    """The plots of these fields: those of :data:`HEADS` in their order, then those that fields alone name."""
+    heads = {head.key: head for head in HEADS}
+    for field in fields:
+        if field.shown.plot:
+            own = Plot(
+                field.shown.plot, field.doc.capitalize(), field.drawn_unit, held=field.kind in ("u4", "u8")
+            )
+            heads.setdefault(own.key, own)
+    made = [replace(head, curves=_curves(head.key, fields)) for head in heads.values()]
+    return tuple(plot for plot in made if plot.curves)
+
+
+def _curves(key: str, fields: Sequence[Field]) -> tuple[Curve, ...]:
+    """The curves of a plot, its fields by their place."""
+    own = sorted((f for f in fields if f.shown.plot == key), key=lambda f: f.shown.place)
+    return (*map(_curve, own), *DERIVED.get(key, ()))
+
+
+PLOTS: Final = plots_by_field(FIELDS)
 OF_VOLTAGES: Final = ("voltage_d", "d_i")
 """Plots of what a drive that takes a current or a torque does not have."""
 

@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from hil.signals import TickArray
+from hil.signals import FIELDS, Field, TickArray
 from hil.watch.look import Look, figures, outcome
 from hil.watch.registry import WatchError, matching
 
 BINS_PER_S: Final = 100
-CURVES: Final = ("w", "w_ref", "i_q", "i_q_ref", "i_d", "u_q", "u_d", "T_L_hat", "T_L_true", "lateness_ns")
+CURVES: Final = tuple(field for field in FIELDS if field.shown.live)
+LIVE: Final = ("speed", "current", "command", "load torque", "lateness")
+"""Order of the page's plots; those of other names come behind."""
+COMMAND_UNIT: Final = "V, or what the drive takes"
 EVENTS: Final = 8
 
 
@@ -36,11 +40,21 @@ def binned(ticks: TickArray, rate_hz: int) -> dict[str, list[float]]:
     starts = np.flatnonzero(np.diff(ticks["k"] // width, prepend=np.uint64(2**63)))
     t = ticks["k"][starts].astype(np.float64) / rate_hz
     out = {"t": np.repeat(t, 2).round(6).tolist()}
-    for name in CURVES:
-        values = ticks[name].astype(np.float64) * (1e-3 if name == "lateness_ns" else 1.0)
+    for field in CURVES:
+        values = ticks[field.name].astype(np.float64) * field.scale
         low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
-        out[name] = np.column_stack((low, high)).ravel().round(4).tolist()
+        out[field.name] = np.column_stack((low, high)).ravel().round(4).tolist()
     return out
+
+
+def live_plots(fields: Sequence[Field] = CURVES) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Title with the unit, and the curves as (key, label), for each plot of the page."""
+    plots: dict[str, list[tuple[str, str]]] = {}
+    for field in sorted(fields, key=lambda field: (*LIVE, field.shown.live).index(field.shown.live)):
+        unit = COMMAND_UNIT if field.shown.live == "command" else field.drawn_unit
+        title = f"{field.shown.live} [{unit}]"
+        plots.setdefault(title, []).append((field.name, field.name.removesuffix("_ns")))
+    return list(plots.items())
 
 
 class Feed:
@@ -88,7 +102,9 @@ class Feed:
         entry = found[0]
         run = {"pid": entry.pid, "bus": entry.bus, "log": entry.log, "rate_hz": entry.rate_hz}
         self._said = ""
-        self.opening = [json.dumps({"run": run | {"ticks": entry.ticks, "takes": entry.takes}})]
+        self.opening = [
+            json.dumps({"run": run | {"ticks": entry.ticks, "takes": entry.takes, "plots": live_plots()}})
+        ]
         return list(self.opening)
 
     def _status(self, text: str) -> list[str]:

@@ -3,25 +3,19 @@
 // another address: nothing is asked with this one's token once it has gone, since anybody may have its port.
 (() => {
   const KEPT_S = 30, HEIGHT = 190;
-  const PLOTS = [
-    ["speed [rad/s]", [["w", "measured"], ["w_ref", "reference"]]],
-    ["current [A]", [["i_q", "q"], ["i_q_ref", "q asked"], ["i_d", "d"]]],
-    ["command [V, or what the drive takes]", [["u_q", "q"], ["u_d", "d"]]],
-    ["load torque [N m]", [["T_L_hat", "estimate"], ["T_L_true", "true"]]],
-    ["lateness [us]", [["lateness_ns", "lateness"]]],
-  ];
   const get = id => document.getElementById(id);
   const colour = name => getComputedStyle(document.documentElement).getPropertyValue("--" + name).trim();
   const token = location.pathname.split("/")[1]; // the address is the key
+  let plotted = []; // [title, [[key, label], ...]] of each plot, as the run says
   let kept = {t: []}, plots = [], socket = null, asked = false;
 
   function build() {
     plots.forEach(plot => plot.chart.destroy());
     const axis = {stroke: colour("soft"), grid: {stroke: colour("line"), width: 1}, ticks: {stroke: colour("line")}};
-    const places = PLOTS.map(() => document.createElement("div")); // all there before one is measured
+    const places = plotted.map(() => document.createElement("div")); // all there before one is measured
     places.forEach(place => { place.className = "plot"; });
     get("plots").replaceChildren(...places);
-    plots = PLOTS.map(([title, curves], n) => {
+    plots = plotted.map(([title, curves], n) => {
       const place = places[n];
       const series = curves.map(([, label], i) =>
         ({label, stroke: colour("c" + i), width: 1.4, points: {show: false}}));
@@ -91,6 +85,8 @@
       get("note").textContent = "";
       get("stop").disabled = false;
       takes(message.run.takes?.w);
+      plotted = message.run.plots;
+      build();
       draw();
     }
     if (message.status) idle(message.status);
@@ -135,6 +131,5 @@
   };
   addEventListener("resize", () => plots.forEach(({chart, place}) => chart.setSize({width: place.clientWidth, height: HEIGHT})));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); draw(); });
-  build();
   connect();
 })();
