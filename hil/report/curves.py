@@ -87,7 +87,10 @@ def plots_by_field(fields: Sequence[Field]) -> tuple[Plot, ...]:
     for field in fields:
         if field.shown.plot:
             own = Plot(
-                field.shown.plot, field.doc.capitalize(), field.drawn_unit, held=field.kind in ("u4", "u8")
+                field.shown.plot,
+                field.doc[:1].upper() + field.doc[1:],
+                field.drawn_unit,
+                held=field.kind in ("u4", "u8"),
             )
             heads.setdefault(own.key, own)
     made = [replace(head, curves=_curves(head.key, fields)) for head in heads.values()]
