@@ -18,6 +18,7 @@ from drivers.mapcheck import (
     plain_states,
 )
 from drivers.mapping import COMMANDED_Q, MEASURED, RECEIVED, SENT, DriveMap, Part
+from drivers.oneshot import Shot, bound_shots
 from drivers.payload import NO_PAYLOAD, Layout
 from drivers.signal import Signal
 from drivers.units import DRIVE_TORQUE, FIRST, shown, unit_of
@@ -73,6 +74,10 @@ class _Binder:
         named = {part: getattr(self._map, part) for part in parts if part not in skipped}
         return {part: pair for part, text in named.items() if text for pair in self._pairs(part, (text,))}
 
+    def _shots(self, what: str) -> tuple[Shot, ...]:
+        """The frames that are sent once, laid out."""
+        return bound_shots(what, getattr(self._map, what), self._database, self._add)
+
     def _lead(self) -> str:
         """The message with the command; empty for none."""
         return next((self._sent[part][0] for part in COMMANDED_Q if part in self._sent), "")
@@ -95,6 +100,8 @@ class _Binder:
             emergency,
             heartbeat,
             self._factors,
+            self._shots("start"),
+            self._shots("stop"),
             self._message(self._map.nmt, "nmt"),
             self._database.node.node_id,
         )
@@ -262,11 +269,28 @@ class _Binder:
             if not bare or signal.signed:
                 self._add(f"echo: {where} must be a plain unsigned number")
             return _from_zero(signal, self._first_count())
+        if part == "enable":
+            return self._checked_enable(signal, where)
         if part == "state" and self._map.states:
             if not bare:
                 self._add(f"state: {where} must be a plain number")
             return replace(signal, signed=False, minimum=0.0, maximum=float((1 << signal.length) - 1))
         return signal
+
+    def _checked_enable(self, signal: Signal, where: str) -> Signal:
+        """The bit or number that enables, as 1 for on and 0 for off."""
+        on, off = self._map.on_value, self._map.off_value
+        if on == off:
+            self._add(f"enable: on_value and off_value are both {on}; the drive could not be switched off")
+            return signal
+        if (on, off) == (1, 0):
+            return signal
+        low, high = signal.raw_range()
+        for name, value in (("on_value", on), ("off_value", off)):
+            if not low <= value <= high or signal.is_float:
+                self._add(f"{name}: {value} does not fit {where}")
+        scale, ends = 1.0 / (on - off), sorted((0.0, 1.0))
+        return replace(signal, scale=scale, offset=-off * scale, minimum=ends[0], maximum=ends[1])
 
     def _first_count(self) -> int:
         """The number with which the command's counter begins; 0 where it can't be known."""

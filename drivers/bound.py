@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from drivers.codec import Message
 from drivers.mapping import COMMANDED_D, COMMANDED_Q, MEASURED, DriveMap
+from drivers.oneshot import Shot
 from drivers.payload import NO_PAYLOAD, Payload
 from drivers.signal import Signal
 
@@ -54,6 +55,8 @@ class Binding:
     heartbeat: Message | None
     factors: Mapping[str, float] = field(default_factory=dict)
     """From the DBC's unit of each part to SI, where they differ."""
+    start: tuple[Shot, ...] = ()
+    stop: tuple[Shot, ...] = ()
     nmt: Message | None = None
     node_id: int = 1
 

@@ -38,6 +38,7 @@ from drivers.frames import (
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
 from drivers.mapping import RECEIVED, DriveMap, house_map
+from drivers.oneshot import NoAnswer, Shot
 from drivers.port import Compiled, Saved, SocketPort
 from drivers.posix import (
     COMMANDED,
@@ -154,6 +155,8 @@ class DriveClient:
             self._sync.raw[4] = min(self._sync.message.length, 1)
             noting = (self._log, self._state, self._sync.raw)
             self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
+        self._on_change = dict.fromkeys(self.binding.map.on_change, b"")
+        """What of those messages was sent last."""
         self._stops = [self._stop_frames(out) for out in self._outgoing]
         self._started, self._left = (self._nmt_frame(command) for command in (START, PRE_OPERATIONAL))
 
@@ -408,7 +411,11 @@ class DriveClient:
             if out.encode(now_ns) < 0:
                 self._refuse(out)
         for out in self._outgoing:
-            self._transmit(out)
+            if out.message.name not in self._on_change:
+                self._transmit(out)
+            elif (data := bytes(out.view[DATA_AT:])) != self._on_change[out.message.name]:
+                self._transmit(out)
+                self._on_change[out.message.name] = data
         self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
 
     def _note_state(self, controlword: int) -> None:
@@ -459,12 +466,44 @@ class DriveClient:
             self._on_frames(self._log_bytes[: count * FRAME.itemsize])
 
     def start(self) -> None:
-        """Start the drive's node (NMT), so that its PDOs go; after arming. Raises LinkError."""
+        """Start the drive's node (NMT) and send its start frames; after arming.
+
+        Raises LinkError, and NoAnswer when the drive does not say what a frame expects.
+        """
         if self._started is not None:
             self._stop_with(self._started)
+        for shot in self.binding.start:
+            self._shoot(shot)
+            time.sleep(shot.wait_s)
+            self._await(shot)
+
+    def _shoot(self, shot: Shot) -> None:
+        """Send a frame that is sent once."""
+        frame = Outgoing(shot.message, 0)
+        frame.view[DATA_AT : DATA_AT + len(shot.data)] = shot.data
+        noting = (self._log, self._state, frame.raw)
+        frame.encode = partial(entry(note_sent, *noting, 0), *noting)
+        self._stop_with(frame)
+
+    def _await(self, shot: Shot) -> None:
+        """Wait until the drive has said all that the frame expects. Raises NoAnswer."""
+        missing, end = list(shot.expected), time.monotonic_ns() + round(shot.within_s * 1e9)
+        while missing and (left := end - time.monotonic_ns()) > 0:
+            frame = self._link.receive(left)
+            if frame is not None:
+                whole = frame.can_id | frame.flags
+                missing = [one for one in missing if not one.came(whole, frame.data)]
+        if missing:
+            raise NoAnswer(
+                f"{shot.message.name} was sent, and {', '.join(map(str, missing))} did not come within "
+                f"{shot.within_s * 1e3:g} ms; look at the drive's state and errors (drive.signals.start)"
+            )
 
     def leave(self) -> None:
-        """Put the drive's node back to pre-operational; never raises. A full queue is tried again."""
+        """Stop frames of the map, node back to pre-operational; never raises. A full queue is tried again."""
+        for shot in self.binding.stop:
+            with contextlib.suppress(Exception):  # the next must be tried
+                self._shoot(shot)
         for _ in range(STOP_REPEATS if self._left is not None else 0):
             with contextlib.suppress(Exception):  # a bus that is down takes nothing at all
                 assert self._left is not None  # noqa: S101 - or there was no round

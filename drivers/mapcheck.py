@@ -63,6 +63,18 @@ def _one_command(drive: DriveMap) -> Iterator[str]:
         yield "i_q and torque: one of them tells what flows; leave the other out"
 
 
+def mistakes_of_changes(made: Binding) -> Iterator[str]:
+    """What is sent on change alone is no frame that counts or carries the command."""
+    names = [bound.message.name for bound in made.outgoing]
+    for name in made.map.on_change:
+        if name not in names:
+            yield f"on_change: {name} is no message of the command"
+        elif name == names[-1]:
+            yield f"on_change: {name} carries the command, which each tick sends"
+        elif any(bound.counter for bound in made.outgoing if bound.message.name == name):
+            yield f"on_change: {name} has a counter, which changes with each tick; leave one out"
+
+
 def _twice(drive: DriveMap, names: Names) -> Iterator[str]:
     """A signal has one part: named twice, one of its values would reach nobody, or both as their OR."""
     roles: dict[Pair, list[str]] = defaultdict(list)
@@ -145,6 +157,7 @@ def mistakes_of_frames(made: Binding, node: NodeRule) -> Iterator[str]:
 
 def mistakes_of_values(made: Binding) -> Iterator[str]:
     """Of what will be sent: stopping must never fail on a range, and both axes have one step."""
+    yield from mistakes_of_changes(made)
     for bound in made.outgoing:
         yield from _unsendable(bound)
     names = ("u_q", "u_d") if made.map.u_q else ("i_q_ref", "i_d_ref")

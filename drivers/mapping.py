@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from drivers.codec import Database
 from drivers.errors import DatabaseError
+from drivers.oneshot import OneShot, shots_from
 from drivers.units import CELSIUS, CURRENT, DRIVE_TORQUE, SPEED, TORQUE, VOLTAGE
 
 PLAIN: Final[dict[str, float]] = {}
@@ -145,6 +146,18 @@ class DriveMap:
     """Emergency message of the drive."""
     heartbeat: str = ""
     """Heartbeat of the drive."""
+    on_value: int = 1
+    """Raw value of enable that switches the drive on."""
+    off_value: int = 0
+    """Raw value of enable that switches the drive off."""
+    on_change: tuple[str, ...] = ()
+    """Messages of the command that are sent when they change and with each stop, not in each tick."""
+    start: tuple[OneShot, ...] = ()
+    """Frames that are sent once after arming, before the first command, each with what it waits for."""
+    stop: tuple[OneShot, ...] = ()
+    """Frames that are sent once after the stop frames."""
+    step: str = ""
+    """Message that moves an emulated drive without SYNC on by a period, in lockstep alone."""
     nmt: str = ""
     """CANopen's NMT message: the drive's node is started after arming, and every stop leaves operation."""
     counters: tuple[str, ...] = ()
@@ -168,6 +181,14 @@ class DriveMap:
     def required(self) -> tuple[str, ...]:
         """Parts that it must have."""
         return REQUIRED[next((part for part in COMMANDED_Q if getattr(self, part)), "u_q")]
+
+
+def completed(parts: DriveMap, *, lockstep: bool, **facts: Any) -> DriveMap:
+    """The map with what the configuration says elsewhere (NO_KEYS).
+
+    In lockstep an emulated drive without SYNC is moved on by its own message.
+    """
+    return replace(parts, sync=parts.step if lockstep and not parts.sync else parts.sync, **facts)
 
 
 def house_map(database: Database) -> DriveMap:
@@ -221,7 +242,11 @@ def map_from_table(table: Mapping[str, Any], where: str) -> DriveMap:
 
 def _value(key: str, value: Any) -> Any:
     """The value of one key in the map's type, None when it has another form."""
-    if key == "counters":
+    if key in ("start", "stop"):
+        return shots_from(value)
+    if key in ("on_value", "off_value"):
+        return value if type(value) is int and 0 <= value < 2**32 else None
+    if key in ("counters", "on_change"):
         texts = isinstance(value, list | tuple) and all(isinstance(one, str) for one in value)
         return tuple(value) if texts else None
     if key == "states":

@@ -145,6 +145,8 @@ class Firmware(Table):
     """Bandwidth of the drive's own current loop."""
     current_period_us: Annotated[int, Field(ge=1, le=100_000)] = 50
     """Sample time of the drive's own current loop."""
+    speed_pll_rad_s: NonNegative = 0.0
+    """Bandwidth of the critically damped PLL that the drive's speed comes from; 0: none."""
     i_limit_a: Positive | None = None
     """Limit of the current that the drive's own loop is asked for; left out: none."""
     torque_constant_n_m_a: Positive | None = None
@@ -262,9 +264,9 @@ class PlantConfig(Table):
     """Path of the DBC that the drive speaks, relative to this file."""
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """Number of the drive on the bus."""
-    protocol: Literal["house", "inverter", "cia402"] = "house"
+    protocol: Literal["house", "inverter", "cia402", "odrive"] = "house"
     """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo;
-    cia402: CANopen, mute until hil configure has mapped its PDOs."""
+    cia402: CANopen, mute until hil configure has mapped its PDOs; odrive: CAN Simple."""
     eds: str = ""
     """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"
@@ -349,6 +351,7 @@ def _current_loop(motor: PlantMotor, firmware: Firmware) -> dict[str, float]:
     (gain_q, reset_q), (gain_d, reset_d) = (gains(motor.R_s_ohm, L, b, T) for L in (motor.L_q_h, motor.L_d_h))
     return {
         "takes": int(takes),
+        "pll": firmware.speed_pll_rad_s,
         "drive_k_t": firmware.torque_constant_n_m_a or 1.5 * motor.n_p * motor.psi_f_wb,
         "i_limit": firmware.i_limit_a or math.inf,
         "current_ns": firmware.current_period_us * 1000,

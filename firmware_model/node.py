@@ -29,6 +29,7 @@ from firmware_model.faulty_plant import PlantFaults, advance_open_phase
 from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.kernels import Kernels
+from firmware_model.odrive import ODriveFrames
 from firmware_model.plant import State
 from firmware_model.station import (
     ANSWER,
@@ -42,7 +43,7 @@ from firmware_model.station import (
     station,
 )
 
-Frames = HouseFrames | InverterFrames | Cia402Frames
+Frames = HouseFrames | InverterFrames | Cia402Frames | ODriveFrames
 
 Eds = tuple[Path, dict[int, dict[int, bytes]]]
 """A CANopen node's EDS, and what it has stored."""
@@ -50,7 +51,7 @@ BLACK_BOX = "black box: "
 LOOK_NS = 1_000_000_000
 """So long a busy drive serves the bus without asking whether to stop; a signal asks at once."""
 RUN_OUT_NS = 500_000_000
-Protocol = Literal["house", "inverter", "cia402"]
+Protocol = Literal["house", "inverter", "cia402", "odrive"]
 
 
 def frames_of(
@@ -60,6 +61,8 @@ def frames_of(
     if protocol == "cia402":
         path, stored = eds or (Path(), {})
         return Cia402Frames(path, database.node.node_id, stored)
+    if protocol == "odrive":
+        return ODriveFrames(database.node.node_id, truth=truth)
     return InverterFrames(truth=truth) if protocol == "inverter" else HouseFrames(database, truth=truth)
 
 
@@ -92,7 +95,8 @@ class Node:
         eds: Path | None = None,
         faults: PlantFaults | None = None,
     ) -> None:
-        self._link, self._clock, self._pacing, self._period_ns = link, clock, pacing, period_ns
+        self._link, self._clock, self._period_ns = link, clock, period_ns
+        self._pacing = "sync" if protocol == "odrive" and clock == "lockstep" else pacing
         self._make_frames = functools.partial(
             frames_of, database, protocol, truth, (eds, {}) if eds else None
         )

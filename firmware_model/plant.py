@@ -123,6 +123,7 @@ PARAMS: Final = np.dtype(
         ("gain_d", "f8"),
         ("reset_q", "f8"),
         ("reset_d", "f8"),
+        ("pll", "f8"),
     ],
     align=True,
 )
@@ -166,11 +167,14 @@ STATE: Final = np.dtype(
         ("d_ref", "f8"),
         ("q_total", "f8"),
         ("d_total", "f8"),
+        ("pll_w", "f8"),
+        ("pll_rate", "f8"),
     ],
     align=True,
 )
 """x = (w, i_q, i_d), room for its series and those of the loads; plant time from the first SYNC;
-latched and pending command; CiA 402 state; references [A] and integrators [V] of the current loop.
+latched and pending command; CiA 402 state; references [A] and integrators [V] of the current loop;
+speed and its rate by the PLL.
 """
 
 SAMPLE: Final = np.dtype(

@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -25,7 +25,7 @@ from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
-from drivers.mapping import MEASURED, RECEIVED, DriveMap, house_map, map_from_table
+from drivers.mapping import MEASURED, RECEIVED, DriveMap, completed, house_map, map_from_table
 from drivers.signal import Signal
 from drivers.watch import CommandWatch
 from hil import fused, realtime
@@ -135,7 +135,7 @@ def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
     table = config.drive.signals
     if table is None:
         return house_map(database)
-    return replace(map_from_table(table, f"{where}: drive.signals"), **config.map_facts)
+    return completed(map_from_table(table, f"{where}: drive.signals"), **config.map_facts)
 
 
 def wire_facts(binding: Binding) -> WireFacts:
@@ -192,6 +192,9 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     load = config.controller.kind == "fac"
     parts = drive_map(config, database, str(path))
     period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
+    if parts.sync and parts.sync == parts.step:  # lockstep: it paces the loop
+        loop = config.loop.model_copy(update={"pacing": "sync"})
+        config = config.model_copy(update={"loop": loop})
     binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
     shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
@@ -387,7 +390,7 @@ def _client(
     load = setup.config.controller.kind == "fac"
     link: Link = open_link(bus_settings(setup.config))
     if setup.config.loop.clock == "lockstep":
-        sync = setup.database.optional("SYNC")
+        sync = setup.binding.sync
         link = LockstepLink(link, sync.send_id if sync else None)
     return DriveClient(
         link, setup.database, load=load, drive_map=setup.binding.map, on_frames=on_frames, now=now

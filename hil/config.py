@@ -707,9 +707,10 @@ class RunConfig(Table):
 
     @property
     def map_facts(self) -> dict[str, Any]:
-        """What a map of the drive's signals needs besides the signals, by DriveMap's names."""
+        """What a drive's map needs of the other tables: :func:`drivers.mapping.completed`."""
         rated = self.drive.rated_current_arms
         return {
+            "lockstep": self.loop.clock == "lockstep",
             "pole_pairs": self.motor.n_p,
             "k_t": self.drive_k_t,
             "rated_torque": self.drive.rated_torque_n_m,

@@ -162,6 +162,9 @@ def _map_schema() -> Schema:
     table = TypeAdapter(DriveMap).json_schema()
     for name in NO_KEYS:  # said elsewhere
         del table["properties"][name]
+    table.pop("$defs", None)
+    for name in ("start", "stop"):
+        table["properties"][name]["items"] = {"type": "object", "required": ["message"]}
     for name, text in docs_of(DriveMap).items():
         if name in table["properties"]:
             table["properties"][name] |= {"description": sentence(text)}

@@ -55,7 +55,17 @@ COUNTS: Final = (
     "bits",
     "passes",
 )
-NUMBERS: Final = ("n_p", "fifo_priority", "cpu", "node_id", "seed", "damping", "share")
+NUMBERS: Final = (
+    "on_value",
+    "off_value",
+    "n_p",
+    "fifo_priority",
+    "cpu",
+    "node_id",
+    "seed",
+    "damping",
+    "share",
+)
 PURE: Final = frozenset((*COUNTS, *NUMBERS, "covariance", "mean"))
 """What has no unit of its own: counts, numbers of things, ratios, and what has those of other keys."""
 

@@ -7,7 +7,6 @@ computed; a log that lost frames, or whose map is of another version, is not com
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ import numpy as np
 from drivers.binding import Binding, bind
 from drivers.codec import Database
 from drivers.errors import DriverError
-from drivers.mapping import RECEIVED, house_map, map_from_table
+from drivers.mapping import RECEIVED, completed, house_map, map_from_table
 from drivers.refeed import refeed
 from drivers.tables import incoming_tables
 from drivers.wire import FRAME, STATE
@@ -50,7 +49,7 @@ def binding_of(log: Log) -> tuple[Binding, RunConfig]:
     table = config.drive.signals
     parts = house_map(database)
     if table is not None:
-        parts = replace(map_from_table(table, "drive.signals"), **config.map_facts)
+        parts = completed(map_from_table(table, "drive.signals"), **config.map_facts)
     return bind(parts, database, load=config.controller.kind == "fac"), config
 
 

@@ -1,0 +1,173 @@
+"""ODrive's CAN Simple: bytes pinned by hand, the emulated frames by cantools, and a whole run of both."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cantools.database
+import numpy as np
+import pytest
+
+from drivers.bus import BusSettings, Frame, Link, open_link
+from drivers.client import DriveClient
+from drivers.errors import DatabaseError
+from drivers.oneshot import NoAnswer
+from firmware_model.odrive import ODriveFrames
+from hil.app import Overrides, Setup, load_setup
+from hil.demo import closed_loop
+from hil.replay import replay
+from hil.signals import Controlword, DriveState, Reason, new_ticks
+from tests.conftest import CONFIGS
+
+PATH = CONFIGS / "odrive.toml"
+NODE = 1
+HEARTBEAT, STATE, ESTIMATES, MODE, TORQUE, IQ, CLEAR = (
+    NODE << 5 | c for c in (1, 7, 9, 0xB, 0xE, 0x14, 0x18)
+)
+
+
+def setup_of(*settings: str) -> Setup:
+    return load_setup(PATH, Overrides(settings=settings))
+
+
+class Bus:
+    """A client on a bus of its own, and what somebody else hears there."""
+
+    def __init__(self, channel: str) -> None:
+        settings = BusSettings("hil-local", channel, 1_000_000, None, False)
+        setup = setup_of()
+        self.other: Link = open_link(settings)
+        self.client = DriveClient(open_link(settings), setup.database, drive_map=setup.binding.map)
+
+    def heard(self) -> list[tuple[int, bytes]]:
+        frames: list[tuple[int, bytes]] = []
+        while frame := self.other.receive(20_000_000):
+            frames.append((frame.can_id, bytes(frame.data)))
+        return frames
+
+
+@pytest.fixture
+def bus(request: pytest.FixtureRequest) -> Iterator[Bus]:
+    made = Bus(f"odrive-{time.monotonic_ns()}")
+    yield made
+    made.client.close()
+    made.other.close()
+
+
+def test_the_start_frames_wait_for_the_heartbeat(bus: Bus) -> None:
+    bus.other.send(HEARTBEAT, struct.pack("<IBBBx", 0x1000, 1, 0, 0))  # it still has its error
+    bus.other.send(HEARTBEAT, struct.pack("<IBBBx", 0, 1, 0, 0))
+    bus.client.start()
+    assert bus.heard() == [(CLEAR, b"\0"), (MODE, struct.pack("<II", 1, 1))]
+
+
+def test_a_drive_that_keeps_its_error_is_told_and_not_started(bus: Bus) -> None:
+    bus.other.send(HEARTBEAT, struct.pack("<IBBBx", 0x1000, 1, 0, 0))
+    with pytest.raises(
+        NoAnswer, match=r"Set_Controller_Mode was sent, and Heartbeat\.Axis_Error = 0 did not"
+    ):
+        bus.client.start()
+
+
+def test_the_axis_state_is_sent_when_it_changes_and_with_each_stop(bus: Bus) -> None:
+    ticks = new_ticks()
+    tick = ticks[0]
+    bus.client.prepare(tick)
+    for word, torque in ((Controlword.SHUTDOWN, 0.0), (Controlword.ENABLE_OPERATION, 1.5)):
+        for _ in range(3):
+            tick["controlword"], tick["u_q"] = word, torque
+            bus.client.send(tick)
+    sent = bus.heard()
+    assert [data for can_id, data in sent if can_id == STATE] == [struct.pack("<Q", 1), struct.pack("<Q", 8)]
+    torques = [data for can_id, data in sent if can_id == TORQUE]
+    assert torques == [struct.pack("<fxxxx", 0.0)] * 3 + [struct.pack("<fxxxx", 1.5)] * 3
+    bus.client.stop()
+    stopped = bus.heard()
+    assert stopped == [(STATE, struct.pack("<Q", 1)), (TORQUE, bytes(8))] * 5
+
+
+class Drive:
+    """What the frames' rules need of the drive behind."""
+
+    def __init__(self) -> None:
+        self.state: Any = {"state": int(DriveState.SWITCH_ON_DISABLED)}
+        self.commands: list[tuple[int, float]] = []
+
+    def command(self, _counter: int, word: int, torque: float, _d: float) -> None:
+        self.commands.append((word, torque))
+
+
+def test_the_emulated_drive_takes_a_torque_in_mode_1_1_and_state_8_alone() -> None:
+    frames, drive = ODriveFrames(NODE, truth=False), Drive()
+
+    def take(can_id: int, data: bytes) -> None:
+        frames.take(Frame(can_id, data, 0, False), drive, lambda: None)  # type: ignore[arg-type]
+
+    torque = struct.pack("<fxxxx", 2.5)
+    take(TORQUE, torque)
+    assert drive.commands == [(0, 0.0)] and frames.ignored["mode"] == 1
+    take(MODE, struct.pack("<II", 1, 1))
+    take(STATE, struct.pack("<Q", 8))
+    take(TORQUE, torque)
+    assert drive.commands[-1] == (0x06, 2.5)
+    drive.state["state"] = int(DriveState.OPERATION_ENABLED)
+    take(TORQUE, torque[:4])
+    assert frames.ignored["length"] == 1
+    take(STATE, struct.pack("<Q", 1))
+    assert drive.commands[-1] == (0, 0.0)
+
+
+def test_what_the_emulated_drive_sends_is_read_by_cantools() -> None:
+    database = cantools.database.load_file(CONFIGS / "drives/odrive.dbc", strict=False)
+    out = {
+        "error": 0x8130, "state": int(DriveState.FAULT), "v_dc": 540.5, "temperature_motor": 30.0,
+        "i_q": -2.5, "temperature_inverter": 25.0, "w": 80.0, "T_L_true": 5.5, "w_true": 80.0,
+    }  # fmt: skip
+    frames = ODriveFrames(NODE, truth=True).answer(out)
+    read: dict[str, Any] = {}
+    for can_id, data, _ in frames:
+        plain = can_id & 0x1FFFFFFF & ~(0x3F << 5)
+        read |= database.get_message_by_frame_id(plain).decode(data, decode_choices=True)
+    assert str(read["Axis_Error"]) == "WATCHDOG_TIMER_EXPIRED" and str(read["Axis_State"]) == "IDLE"
+    assert read["Vel_Estimate"] == pytest.approx(80.0 / (2 * np.pi), rel=1e-7)
+    assert (read["Iq_Measured"], read["Bus_Voltage"], read["Motor_Temperature"]) == (-2.5, 540.5, 30.0)
+    assert read["LoadTorqueTrue"] == 5.5
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("drive.signals.on_value=1", "on_value and off_value are both 1"),
+        ("drive.signals.on_value=5000000000", "on_value: 5000000000 is not of the form"),
+        ('drive.signals.on_change=["Set_Input_Torque"]', "carries the command, which each tick sends"),
+        ('drive.signals.on_change=["Get_Iq"]', "on_change: Get_Iq is no message of the command"),
+        ('drive.signals.start=[{message="Nothing"}]', "start: "),
+        ('drive.signals.start=[{message="Clear_Errors",values={Foo=1}}]', "Foo"),
+        ('drive.signals.start=[{message="Clear_Errors",expect={Heartbeat=0}}]', "MESSAGE.Signal"),
+        ('drive.signals.start=[{massage="Clear_Errors"}]', "is not of the form that it takes"),
+        ('drive.signals.start=[{message="Clear_Errors",wait_ms=1e9}]', "is not of the form that it takes"),
+        ('drive.signals.stop=[{message="Set_Axis_State",values={Axis_Requested_State=-1}}]', "does not fit"),
+    ],
+)
+def test_a_mistake_of_the_map_is_one_line(setting: str, said: str) -> None:
+    with pytest.raises(DatabaseError) as caught:
+        setup_of(setting)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.compiled
+def test_in_lockstep_it_holds_the_load_and_replays_to_the_bit(tmp_path: Path) -> None:
+    own = ('loop.clock="lockstep"', "loop.duration_s=3.5", f'log.folder="{tmp_path}"')
+    _, result, log = closed_loop(PATH, Overrides(settings=own))
+    ticks = log.ticks
+    assert result.outcome.reason == Reason.STOP_REQUESTED and result.outcome.skipped == 0
+    on = ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
+    assert 2.0 < np.abs(on["w"] - on["w_ref"]).max() < 5.0
+    late = on[(on["t_ns"] > 2_800_000_000) & (on["t_ns"] < 3_400_000_000)]
+    assert np.abs(late["w"] - late["w_ref"]).max() < 0.3
+    assert not ticks["u_q"][ticks["reason"] != 0].any()
+    assert replay(Path(result.log)).verdict == "same"
