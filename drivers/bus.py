@@ -80,7 +80,7 @@ class SocketLink:
     def __init__(
         self, bus: can.BusABC | None, receiving: socket.socket, sending: socket.socket, fd: bool = True
     ) -> None:
-        self._bus, self._receiving, self._sending, self._fd = bus, receiving, sending, fd
+        self._bus, self.receiving, self._sending, self._fd = bus, receiving, sending, fd
         receiving.setblocking(False)
         self._fds = [receiving.fileno()]
         self.fds = np.array([receiving.fileno(), sending.fileno(), 0, 0], np.int32)

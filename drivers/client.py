@@ -18,6 +18,7 @@ from typing import Any, Final, NoReturn
 
 import numpy as np
 
+from drivers.bcm import KernelSync, all_but
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
 from drivers.codec import Database, Message
@@ -95,7 +96,8 @@ def precompile(database: Database, drive_map: DriveMap | None, load: bool, tick:
 class DriveClient:
     """A drive on a link. ``now`` stamps frames; ``on_frames`` sees each frame sent or received.
 
-    ``drive_map`` says which frame plays which part; without one the DBC is of the house protocol.
+    ``drive_map`` says which frame plays which part; without one the DBC is of the house protocol. ``timed``
+    sends SYNC for it; it is stopped with the client's own stop, and once the bus was down.
     """
 
     def __init__(
@@ -107,7 +109,9 @@ class DriveClient:
         on_frames: OnFrames | None = None,
         now: Callable[[], int] = time.monotonic_ns,
         drive_map: DriveMap | None = None,
+        timed: KernelSync | None = None,
     ) -> None:
+        self._timed = timed
         self._link, self._on_frames, self._now = link, on_frames, now
         self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
         self._raw_link = raw_link(link, any(bound.message.fd for bound in self.binding.outgoing))
@@ -133,6 +137,8 @@ class DriveClient:
         self._last = np.full(max(len(self.binding.incoming), 1), -1, np.int64)
         link, real = self._raw_link, self._now is time.monotonic_ns
         shared = {"state": self._state, "words": self._words, "log": self._log}
+        if self._timed is not None:
+            shared["ear"] = self._timed.words
         self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
         self._drain_socket: Callable[[int, bool], int] | None = None
         self._exchange: Callable[[int], int] | None = None
@@ -200,6 +206,8 @@ class DriveClient:
         self._note_absent(tick)
         self._note_state(0)
         self._sent_cells = [cell_of(tick, name) for name in SENT_FIELDS]
+        if self._timed is not None and isinstance(self._raw_link, SocketLink):
+            all_but(self._raw_link.receiving, self._timed.send_id)  # not before: others were listened for
         if self._port is not None:
             incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
             own = {"tick": raw, **incoming, "codes": codes_of(self.binding.map.states)}
@@ -228,6 +236,11 @@ class DriveClient:
             return None
         places, size = self._port.places, 0 if self._sync is None else len(self._sync.view)
         return Compiled(places.get(exchange), places[follow], places[command], size, self._log)
+
+    @property
+    def timed(self) -> KernelSync | None:
+        """What sends SYNC for it, if anything."""
+        return self._timed
 
     @property
     def command(self) -> Message:
@@ -303,7 +316,7 @@ class DriveClient:
         try:
             flags |= self._drain(deadline_ns) if drain is None else self._go_on(code, drain, deadline_ns)
         except LinkDown:
-            self._cells[_DOWN] = 1
+            self._go_down()
         except LinkError:
             flags |= ERROR_FRAME
         self._flags_cell[0] |= flags | (BUS_DOWN if self._cells[_DOWN] else 0)
@@ -369,7 +382,7 @@ class DriveClient:
     def _on_error(self, error_class: int) -> int:
         """A controller that went off the bus, or came back to it, is down for good: nothing more is sent."""
         if error_class & (BUS_OFF | RESTARTED):
-            self._cells[_DOWN] = 1
+            self._go_down()
         return ERROR_FRAME
 
     def _on_emergency(self, data: bytes) -> int:
@@ -451,10 +464,16 @@ class DriveClient:
         if self._cells[_LOGGED] < len(self._log):
             self._cells[_LOGGED] += 1
 
+    def _go_down(self) -> None:
+        """For good: the kernel would go on with SYNC by itself on an interface that comes up again."""
+        self._cells[_DOWN] = 1
+        if self._timed is not None:
+            self._timed.stop()
+
     def _note_failure(self, error: LinkError) -> None:
         """A bus that is down stays down; anything else is flagged in the next tick."""
         if isinstance(error, LinkDown):
-            self._cells[_DOWN] = 1
+            self._go_down()
         else:
             self._cells[_PENDING] |= SEND_FAILED
 
@@ -522,6 +541,8 @@ class DriveClient:
         The frames are ready since before anything was armed: nothing that can be wrong with a command keeps
         one of them from being sent, and one that can't be sent keeps not the others.
         """
+        if self._timed is not None:
+            self._timed.stop()
         counter = self._cells[_LAST_SENT]
         for _ in range(STOP_REPEATS):
             counter = (counter + 1) % self.binding.counter_modulus
@@ -594,4 +615,6 @@ class DriveClient:
 
     def close(self) -> None:
         """Close the link."""
+        if self._timed is not None:
+            self._timed.close()
         self._link.close()

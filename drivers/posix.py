@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numba import types
 
-from drivers.frames import ENABLE_OPERATION, FRESH
+from drivers.frames import ENABLE_OPERATION, FOREIGN_COMMAND, FRESH
 from drivers.jit import array_at, jit, waiting
 from drivers.states import FAULT_RESET, state_of
 from drivers.wire import (
@@ -37,12 +37,13 @@ _types: Any = types
 carray: Any = numba.carray  # type: ignore[attr-defined]
 _int, _word, _pointer = _types.int32, _types.intp, _types.uintp
 _recv = _types.ExternalFunction("recv", _word(_int, _pointer, _pointer, _int))
+_recvmsg = _types.ExternalFunction("recvmsg", _word(_int, _pointer, _int))
 _send = _types.ExternalFunction("send", _word(_int, _pointer, _pointer, _int))
 _ppoll = _types.ExternalFunction("ppoll", _int(_pointer, _pointer, _pointer, _pointer))
 _clock_gettime = _types.ExternalFunction("clock_gettime", _int(_int, _pointer))
 _errno_location = _types.ExternalFunction("__errno_location", _types.CPointer(_int)())
 
-MONOTONIC: Final = 1
+REALTIME, MONOTONIC = 0, 1
 DONTWAIT: Final = 0x40
 POLLIN: Final = 1
 SYNC_COUNTS: Final = 240
@@ -63,6 +64,15 @@ RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
 FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE, STATE_AT, HEARD = range(10)
 """Of ``io``. STATE_AT: offset of the tick's drive_state; HEARD: feedback that :func:`follow` took before
 what it left to its caller."""
+EAR_FD, PERIOD, SYNCED, STAMP, MESSAGE_AT = range(5)
+IOV_AT, CONTROL_AT, FRAME_AT, EAR_WORDS = 11, 13, 21, 30
+"""Words of an ear: its descriptor, the period, how many SYNCs were heard since the last look, when the newest
+was [ns]; then the message header of recvmsg, and what it points to: control data with a stamp, a frame."""
+CONTROL_BYTES, FRAME_BYTES = 8 * (FRAME_AT - CONTROL_AT), 8 * (EAR_WORDS - FRAME_AT)
+HEAR_MOST: Final = 1024
+"""SYNCs that one look takes."""
+AGE_MOST_NS: Final = 1_000_000_000
+"""Older stamps are those of a clock that was set meanwhile."""
 DRAIN_MOST: Final = 256
 """Frames that are still read once the time has passed; a flood can't exceed it."""
 
@@ -70,12 +80,12 @@ ARRAYS: Final = {
     "fds": np.dtype("i4"), "times": np.dtype("i8"), "io": np.dtype("i8"), "raw": np.dtype("u1"),
     "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
     "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
-    "sync": np.dtype("u1"), "codes": np.dtype("i8"),
+    "sync": np.dtype("u1"), "codes": np.dtype("i8"), "ear": np.dtype("i8"),
 }  # fmt: skip
 """The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
 kernels here, the others of :mod:`drivers.wire`."""
 FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST = range(8)
-STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES = range(8, 15)
+STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES, EAR = range(8, 16)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
 
 
@@ -126,6 +136,7 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
     raw, last, state = array_at(places, RAW, U1), array_at(places, LAST, I8), array_at(places, STATES, STATE)
     messages, signals = array_at(places, MESSAGES, MESSAGE), array_at(places, SIGNALS, SIGNAL)
     words, tick, log = array_at(places, WORDS, U4), array_at(places, TICK, U1), array_at(places, LOG, FRAME)
+    ear = array_at(places, EAR, I8)
     while io[MORE] > 0:
         left_ns = max(deadline_ns - now_ns(times), 0) if deadline_ns > 0 else 0
         if left_ns > 0:
@@ -143,6 +154,9 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
             if size != -EAGAIN:
                 return size
             break
+        if len(ear) > 0:
+            hear(ear, io, state, log, times)
+            late = ear[SYNCED] == 0
         seen = take(raw, messages, signals, last, state, words, tick, log, size, late, now_ns(times))
         if seen >= STATE_RAW and io[STATE_AT] > 0:
             cell = tick[io[STATE_AT] : io[STATE_AT] + 4].view(np.uint32)
@@ -155,8 +169,42 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
         io[FLAGS] |= seen
         if deadline_ns > 0 and seen & FRESH:
             break
+    if len(ear) > 0:
+        hear(ear, io, state, log, times)
     finish(io, tick)
     return DONE
+
+
+@jit
+def hear(ear: Any, io: Any, state: Any, log: Any, times: Any) -> None:
+    """Take the SYNCs that the kernel has sent for us, with their stamps, before what answers them.
+
+    One that does not have the next counter is another controller's. Nothing is looked for while none is due.
+    The stamps are of the wall clock: their age counts, and one of an impossible age is as if heard just now.
+    """
+    if ear[SYNCED] > 0 and now_ns(times) - ear[STAMP] < ear[PERIOD] // 2:
+        return
+    s, raw = state[0], ear[FRAME_AT:].view(np.uint8)
+    for _ in range(HEAR_MOST):
+        ear[MESSAGE_AT + 5] = CONTROL_BYTES
+        if _recvmsg(np.int32(ear[EAR_FD]), ear[MESSAGE_AT:].ctypes.data, DONTWAIT) <= 0:
+            return
+        sent_ns = ear[CONTROL_AT + 2] * 1_000_000_000 + ear[CONTROL_AT + 3]
+        age_ns = clock_ns(REALTIME, times) - sent_ns
+        if age_ns < 0 or age_ns > AGE_MOST_NS:
+            age_ns = 0
+        at_ns, due = now_ns(times) - age_ns, s["syncs"] % SYNC_COUNTS + 1
+        own = raw[4] == 0 or raw[DATA_AT] == due
+        note(log, s, raw, 0 if own else 1, at_ns)
+        if s["logged"] < len(log):
+            s["logged"] += 1
+        if not own:
+            io[FLAGS] |= FOREIGN_COMMAND
+            continue
+        s["syncs"], ear[STAMP] = due, at_ns
+        ear[SYNCED] += 1
+        if age_ns < ear[PERIOD] // 2:
+            return
 
 
 @jit

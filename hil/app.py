@@ -17,12 +17,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from drivers.bcm import KernelSync, kernel_sync
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, Link, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
 from drivers.client import DriveClient, OnFrames, precompile
 from drivers.codec import Database
 from drivers.errors import DriverError, LinkError
+from drivers.jit import COMPILED
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
 from drivers.mapping import MEASURED, RECEIVED, DriveMap, completed, house_map, map_from_table
@@ -197,6 +199,7 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
         config = config.model_copy(update={"loop": loop})
     binding = bind(parts, database, load=load, period_ms=period_ms)
     _check_pacing(path, config, binding)
+    _check_sync(path, config, binding)
     shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
     wire = wire_facts(binding)
     _check_command(path, config)
@@ -224,6 +227,24 @@ def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
         raise ConfigError(
             str(path), ['loop.pacing: the drive takes no SYNC (drive.signals has no sync); take "feedback"']
         )
+
+
+def _check_sync(path: Path, config: RunConfig, binding: Binding) -> None:
+    """Where the kernel can send SYNC in the loop's place. Raises ConfigError."""
+    loop = config.loop
+    if config.bus.sync == "loop":
+        return
+    needs = {
+        'bus.interface = "socketcan"': config.bus.interface == "socketcan",
+        'loop.pacing = "sync", and a drive that takes it': loop.pacing == "sync" and binding.sync is not None,
+        'loop.clock = "realtime"': loop.clock == "realtime",
+        "a run that sends: no loop.shadow": not loop.shadow,
+        "a SYNC of at most one byte": binding.sync is None or binding.sync.length <= 1,
+        "compiled kernels: no NUMBA_DISABLE_JIT": COMPILED,
+    }
+    lacking = [need for need, there in needs.items() if not there]
+    if lacking:
+        raise ConfigError(str(path), [f'bus.sync: "kernel" needs {lacking[0]}; else take "loop"'])
 
 
 def bus_settings(config: RunConfig) -> BusSettings:
@@ -376,7 +397,7 @@ def opened_client(
 ) -> Iterator[DriveClient]:
     """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
     on_frames = recorder.frames if recorder and setup.config.log.frames else None
-    client = _client(setup, watch.chained(on_frames) if watch else on_frames, clock.now_ns)
+    client = _client(setup, watch.chained(on_frames) if watch else on_frames, clock.now_ns, controls=True)
     try:
         yield client
     finally:
@@ -384,17 +405,34 @@ def opened_client(
 
 
 def _client(
-    setup: Setup, on_frames: OnFrames | None = None, now: Callable[[], int] = time.monotonic_ns
+    setup: Setup,
+    on_frames: OnFrames | None = None,
+    now: Callable[[], int] = time.monotonic_ns,
+    controls: bool = False,
 ) -> DriveClient:
-    """A drive client on a link of its own."""
+    """A drive client on a link of its own; one that ``controls`` may have SYNC by the kernel."""
     load = setup.config.controller.kind == "fac"
     link: Link = open_link(bus_settings(setup.config))
     if setup.config.loop.clock == "lockstep":
         sync = setup.binding.sync
         link = LockstepLink(link, sync.send_id if sync else None)
     return DriveClient(
-        link, setup.database, load=load, drive_map=setup.binding.map, on_frames=on_frames, now=now
+        link,
+        setup.database,
+        load=load,
+        drive_map=setup.binding.map,
+        on_frames=on_frames,
+        now=now,
+        timed=sync_by_kernel(setup) if controls else None,
     )
+
+
+def sync_by_kernel(setup: Setup) -> KernelSync | None:
+    """What sends SYNC in the loop's place, where the config asks for it. Raises LinkError."""
+    bus, sync = setup.config.bus, setup.binding.sync
+    if bus.sync == "loop" or sync is None:
+        return None
+    return kernel_sync(bus.channel, sync.send_id, sync.length > 0, setup.config.loop.period_ns)
 
 
 def check_arming(setup: Setup, arm: bool) -> None:
@@ -555,7 +593,7 @@ def _recorded(
         say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
         drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
         if words:
-            drive = GuardedDrive(client, words, clock.now_ns)
+            drive = GuardedDrive(client, words, clock.now_ns, client.timed)
         if watch:
             recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
         machine, plan = setup.machine.fresh(), plan_of(config)
@@ -565,7 +603,7 @@ def _recorded(
         takes = set_by_others(setup)
         with contextlib.closing(Inbox(machine, takes)) as inbox, _started(None if watch else client):
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
-            loop = Loop(*parts, inbox if takes else None)
+            loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()
             return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length)
 
@@ -623,7 +661,8 @@ def plan_of(config: RunConfig) -> Plan:
     """Timing of the run."""
     loop = config.loop
     ticks = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
-    pacing = "feedback" if loop.shadow and loop.pacing == "sync" else loop.pacing
+    follows = loop.pacing == "sync" and (loop.shadow or config.bus.sync == "kernel")
+    pacing = "feedback" if follows else loop.pacing
     return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks)
 
 

@@ -233,6 +233,8 @@ class BusTable(Table):
     """Bits a second of the data phase of CAN FD; left out: as bitrate."""
     fd: bool = False
     """CAN FD."""
+    sync: Literal["loop", "kernel"] = "loop"
+    """Who sends SYNC: the loop, or the kernel by its own timer (socketcan alone, in real time)."""
 
 
 Takes = Literal["voltage", "current", "torque"]

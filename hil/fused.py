@@ -23,13 +23,16 @@ from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, wai
 from drivers.posix import (
     COMMANDED,
     DONE,
+    EAR,
     EINTR,
     EXCHANGED,
     IO,
     LEFT,
     MONOTONIC,
     PENDING,
+    STAMP,
     STATES,
+    SYNCED,
     WAITS,
     clock_ns,
     command,
@@ -62,6 +65,7 @@ from hil.loop import (
     Whole,
     missed,
     none_compiled,
+    wait_ns,
 )
 from hil.signals import ALL_MISSING, TICK
 from hil.trouble import TROUBLE
@@ -85,7 +89,7 @@ I8: Final = np.dtype(np.int64)
 
 RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, ROWS = range(12)
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
-PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END = range(4)
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS = range(5)
 
 
 def whole_tick(
@@ -106,7 +110,9 @@ def whole_tick(
     if ports is None or receive is None:
         return none_compiled
     end = NEVER if plan.ticks is None else plan.ticks
-    timing = np.array([plan.period_ns, plan.timeout_ns, ports.sync_bytes, end])
+    timing = np.array(
+        [plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None)]
+    )
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks = np.zeros(0, np.int64) if marks is None else marks
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
@@ -121,7 +127,7 @@ def whole_tick(
 def _compiled(kernel: Any) -> Callable[..., int]:
     """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(END + 1, np.int64)}
+    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(WAIT_NS + 1, np.int64)}
     for row, array in known.items():
         table[row] = place_of(array, I8)
     compiled: Callable[..., int] = entry(kernel, table, 0, 0, 0, False)
@@ -281,8 +287,12 @@ def heard(table: Any, t: Any, k: int, deadline_ns: int, asked: int, count: int) 
     """Stamp a tick that feedback woke, as :mod:`hil.loop` does; return its deadline, which may be later."""
     plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
     now, period_ns = now_ns(array_at(table, TIMES_AT, I8)), plan[PERIOD_NS]
+    jumped, ear = int(t["rx_flags"] & np.uint32(COUNTER_JUMP)), array_at(places_at(table, RECEIVE), EAR, I8)
+    if len(ear) > 0:
+        count, jumped, ear[SYNCED] = ear[SYNCED], 0, 0
+        now = ear[STAMP] if count > 0 else now
     late_ns = now - pace[ARRIVED] - period_ns
-    skipped = missed(count, int(t["rx_flags"] & np.uint32(COUNTER_JUMP)), late_ns, period_ns)
+    skipped = missed(count, jumped, late_ns, period_ns)
     k, deadline_ns = k + skipped, deadline_ns + skipped * period_ns
     expected_ns = pace[ARRIVED] + (1 + skipped) * period_ns
     pace[ARRIVED] = now if count > 0 else expected_ns
@@ -304,7 +314,7 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     t = ticks[0]
     request = t["request"]
     stamp(t, k, deadline_ns, deadline_ns, asked, log_failed)
-    count = follow(places, pace[ARRIVED] + plan[PERIOD_NS] * 3 // 2, QUEUE_MOST)
+    count = follow(places, pace[ARRIVED] + plan[WAIT_NS], QUEUE_MOST)
     mark(marks, READ, times)
     if count == WAITS:
         return NOT_BEGUN

@@ -31,7 +31,7 @@ from hil import realtime
 from hil.clock import RealClock
 from hil.errors import HilError
 from hil.lifeline import BYTES, Lifeline
-from hil.ports import Drive
+from hil.ports import Drive, Timed
 from hil.signals import DriveState, RxFlag, cell
 
 GUARDIAN_LOST_NS = 500_000_000
@@ -91,8 +91,10 @@ class Words:
 class GuardedDrive:
     """A drive port that tells the guardian of each tick; nothing is sent once the guardian has fired."""
 
-    def __init__(self, drive: Drive, words: Words, now: Callable[[], int]) -> None:
-        self._drive, self._words, self._now = drive, words.cells, now
+    def __init__(
+        self, drive: Drive, words: Words, now: Callable[[], int], timed: Timed | None = None
+    ) -> None:
+        self._drive, self._words, self._now, self._timed = drive, words.cells, now, timed
 
     def prepare(self, tick: Any) -> None:
         """Reach the fields of the record."""
@@ -112,7 +114,9 @@ class GuardedDrive:
         self._note_guardian()
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
-        """Feedback, and what the guardian did."""
+        """Feedback, and what the guardian did; once it has fired, the kernel sends no SYNC for us either."""
+        if self._timed is not None and self._words[FIRED]:
+            self._timed.stop()
         self._drive.receive(tick, deadline_ns)
         self._note_guardian()
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba.extending import register_jitable
 
-from hil.ports import Clock, Drive, Inbox, Recorder
+from hil.ports import Clock, Drive, Inbox, Recorder, Timed
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, cell, ticks_from
 from hil.trouble import TROUBLE, Trouble
 
@@ -44,13 +44,20 @@ ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 
 RAMP_DOWN, STOP = int(Request.RAMP_DOWN), int(Request.STOP)
 BUS_DOWN, SEND_FAILED = int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
-NEVER = 2**63
+NEVER = 2**63 - 1
+STEER_EVERY = 64
+"""Periods between two looks at the phase of a SYNC that the kernel times."""
 RAMP_EVENT = "ramp-down", "a stop was asked: the speed reference ramps to 0"
 
 
 def bounded(ns: int) -> int:
     """A stamp as the record holds it."""
     return ns if -MAX_NS <= ns <= MAX_NS else (MAX_NS if ns > 0 else -MAX_NS)
+
+
+def wait_ns(plan: Plan, timed: bool) -> int:
+    """How long after the last feedback, or the last SYNC of the kernel's, the next is waited for."""
+    return plan.period_ns + plan.timeout_ns if timed else plan.period_ns * 3 // 2
 
 
 class StopRequest:
@@ -158,7 +165,9 @@ class Loop:
         request: StopRequest,
         whole: Callable[[Pace], Whole] = no_whole,
         inbox: Inbox | None = None,
+        timed: Timed | None = None,
     ) -> None:
+        self._timed = timed
         self._drive, self._clock, self._recorder = drive, clock, recorder
         self._step, self._ticks, self._plan, self._request = step, ticks, plan, request
         self._end = NEVER if plan.ticks is None else plan.ticks
@@ -182,6 +191,8 @@ class Loop:
         try:
             self._run()
         finally:
+            if self._timed is not None:
+                self._timed.stop()
             self._drive.stop()
         return self._outcome
 
@@ -190,6 +201,8 @@ class Loop:
         tick, whole, compiled = self._tick, self._whole, self._whole is not none_compiled
         follows = self._plan.pacing == "feedback"
         start_ns = self._start_ns = self._clock.now_ns()
+        if self._timed is not None:
+            self._timed.start()
         k = 0
         while True:
             deadline_ns = start_ns + k * period_ns
@@ -201,6 +214,8 @@ class Loop:
             outcome.ticks += 1
             if self._ended:
                 return
+            if self._timed is not None and not k % STEER_EVERY:
+                self._timed.steer(k, start_ns + k * period_ns)
             k += 1
 
     def _followed(self) -> tuple[int, int]:
@@ -307,6 +322,7 @@ class Loop:
         """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
 
         Each feedback is one period of the drive's clock, and so is each that is missing: k follows the time.
+        Where the kernel sends SYNC, each SYNC is one period, and its stamp is when it came.
         Lateness is how much later it came than it was due. Returns k and its deadline.
         """
         flags, pace = self._cells.rx_flags, self._pace
@@ -314,17 +330,20 @@ class Loop:
         if not k:
             pace[ARRIVED] = self._clock.now_ns()
         heard, pace[HEARD] = pace[HEARD], 0
-        until_ns = self._clock.receive_deadline(pace[ARRIVED], plan.period_ns * 3 // 2)
+        until_ns = self._clock.receive_deadline(pace[ARRIVED], wait_ns(plan, self._timed is not None))
         drive.receive(tick, NO_WAIT if heard else until_ns)
         while flags[0] & fresh and heard < QUEUE_MOST:
             heard += 1
             flags[0] = flags[0] & ~fresh
             drive.receive(tick, NO_WAIT)
-        now_ns = self._clock.now_ns()
-        late_ns = now_ns - pace[ARRIVED] - plan.period_ns
-        skipped = missed(heard, flags[0] & COUNTER_JUMP, late_ns, plan.period_ns) if k else 0
+        now_ns, jumped = self._clock.now_ns(), flags[0] & COUNTER_JUMP
         if heard:
             flags[0] = flags[0] | fresh
+        if self._timed is not None:
+            heard, stamp_ns = self._timed.taken()
+            now_ns, jumped = stamp_ns if heard else now_ns, 0
+        late_ns = now_ns - pace[ARRIVED] - plan.period_ns
+        skipped = missed(heard, jumped, late_ns, plan.period_ns) if k else 0
         if skipped:
             k, deadline_ns = k + skipped, deadline_ns + skipped * plan.period_ns
             self._outcome.skipped += skipped

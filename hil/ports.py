@@ -53,6 +53,22 @@ class Clock(Protocol):
         """Latest monotonic time at which the feedback of a tick may come."""
 
 
+class Timed(Protocol):
+    """What sends SYNC in the loop's place, by a timer of its own."""
+
+    def start(self) -> None:
+        """Send the first SYNC now. Raises OSError."""
+
+    def taken(self) -> tuple[int, int]:
+        """How many SYNCs were heard since the last look, and when the newest was sent [ns]."""
+
+    def steer(self, k: int, due_ns: int) -> None:
+        """Keep the newest SYNC, of period k, on the loop's grid, by which it was due at ``due_ns``."""
+
+    def stop(self) -> None:
+        """No SYNC after this; never raises."""
+
+
 class Recorder(Protocol):
     """Takes records without ever blocking; drops are counted."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import select
 import signal
 import socket
 import threading
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.bcm import SO_TIMESTAMPNS, TX_DELETE, KernelSync
 from drivers.bus import BusSettings, SocketLink, open_link
 from drivers.client import DriveClient
 from drivers.local import CLASSIC, pack_frame
@@ -48,7 +50,7 @@ from hil.loop import (
     no_whole,
     none_compiled,
 )
-from hil.signals import FIELDS, Reason, Request, TickArray
+from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.compiled, pytest.mark.process]
@@ -140,7 +142,44 @@ class Cyclic(Drive):
             n += 1
 
 
-Act = Callable[[Drive, int], None]
+class Timed(Drive):
+    """Sends SYNC, too, by a timer that the loop's job has started: the Broadcast Manager's part."""
+
+    def __init__(self, setup: Setup, end: socket.socket, words: Words, act: Act) -> None:
+        super().__init__(setup, end, words, act)
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
+        (job, self.job), (ear, self.ear) = pairs
+        ear.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.sync = KernelSync(job, ear, SYNC, True, PERIOD_NS)
+        self.asked: list[bytes] = []
+
+    def run(self) -> None:
+        self.asked.append(self.job.recv(8192))
+        n, next_ns = 0, time.monotonic_ns()
+        while not self._over.is_set():
+            if self.asked[-1][0] != TX_DELETE:
+                self.beat(n)
+            n, next_ns = n + 1, next_ns + PERIOD_NS
+            self.until(next_ns)
+
+    def until(self, then_ns: int) -> None:
+        """Take what the loop sends and asks of the job meanwhile."""
+        while (left := then_ns - time.monotonic_ns()) > 0:
+            going = [self.job] if self.asked[-1][0] != TX_DELETE else []
+            ready, _, _ = select.select([self.end, *going], [], [], left * 1e-9)
+            if self.end in ready:
+                self.take(self.end.recv(128))
+            if self.job in ready:
+                self.asked.append(self.job.recv(8192) or bytes((TX_DELETE,)))
+
+    def stop(self) -> None:
+        super().stop()
+        self.sync.close()
+        self.job.close()
+        self.ear.close()
+
+
+Act = Callable[[Any, int], None]
 
 
 def calm(drive: Drive, n: int) -> None:
@@ -257,6 +296,39 @@ def emergency_behind(drive: Drive, n: int) -> None:
     drive.end.send(drive.feedback(n))
 
 
+def sync_frame(count: int) -> bytes:
+    """SYNC with its counter from 1 to 240."""
+    return pack_frame(SYNC, bytes((count % 240 + 1,)))
+
+
+def timed(answer: Act, *silent: int) -> Act:
+    """SYNC by the kernel before each answer, but for those."""
+
+    def act(drive: Timed, n: int) -> None:
+        if n not in silent:
+            drive.ear.send(sync_frame(n - sum(other < n for other in silent)))
+        answer(drive, n)
+
+    return act
+
+
+@timed
+@now_and_then(30, 50)
+def answered_late(drive: Timed, n: int) -> None:
+    """Feedback after the loop gave up, and before the next SYNC: it is not applied."""
+    raw = drive.feedback(n)
+    while drive.take(drive.end.recv(128)) != COMMAND:
+        pass
+    drive.end.send(raw)
+
+
+@timed
+@now_and_then(60)
+def sync_of_another(drive: Timed, n: int) -> None:
+    drive.ear.send(sync_frame(n + 99))
+    calm(drive, n)
+
+
 @now_and_then(60)
 def gone(drive: Drive, n: int) -> None:
     drive.end.close()
@@ -321,7 +393,11 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
     recorder.await_open()
     failure = ""
     with ends() as (ours, theirs):
-        client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
+        other = Timed if act in TIMED else Drive if pacing == "sync" else Cyclic
+        drive = other(setup, theirs, words, act)
+        sync = drive.sync if isinstance(drive, Timed) else None
+        link = SocketLink(None, ours, ours)
+        client = DriveClient(link, setup.database, on_frames=recorder.frames, timed=sync)
 
         def counted(pace: Pace) -> Whole:
             made = fused.whole_tick(client, words, machine, recorder, plan, pace)
@@ -333,10 +409,10 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
 
             return whole
 
-        guarded, record = GuardedDrive(client, words, time.monotonic_ns), recorder.record
+        guarded, record = GuardedDrive(client, words, time.monotonic_ns, sync), recorder.record
         whole = counted if compiled else no_whole
-        loop = Loop(guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole)
-        drive = (Drive if pacing == "sync" else Cyclic)(setup, theirs, words, act)
+        parts = guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole
+        loop = Loop(*parts, timed=sync)
         drive.operator = request
         drive.start()
         try:
@@ -468,6 +544,32 @@ def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, tmp_pat
     assert compiled.stages[NOT_BEGUN] == 1 or ended in ("SEND_FAILED", "GUARDIAN")
     assert (BEGUN in compiled.stages) == (BEGUN in left)
     assert compiled.ended == ended and not rules.stages
+
+
+BY_THE_KERNEL: dict[str, tuple[Act, set[int], str]] = {
+    # SYNC is sent by a timer, and heard with its stamps; each SYNC is a period
+    "calm": (timed(calm), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "no feedback": (timed(silent), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "no SYNC": (timed(calm, 40, 41), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "late feedback": (answered_late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "another's SYNC": (sync_of_another, {SENT, NOT_BEGUN}, "FOREIGN_COMMAND"),
+    "emergency": (timed(alarm), {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
+    "the guardian fires": (timed(fired), {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+}
+TIMED = [act for act, _, _ in BY_THE_KERNEL.values()]
+
+
+@pytest.mark.parametrize("name", BY_THE_KERNEL)
+def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, tmp_path: Path) -> None:
+    act, left, ended = BY_THE_KERNEL[name]
+    rules, compiled = both(setup_of('loop.pacing="feedback"'), tmp_path, act)
+    assert_same(rules, compiled)
+    assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
+    assert compiled.ended == ended and not rules.stages
+    stale = compiled.log.ticks["rx_flags"] & int(RxFlag.FRESH) == 0
+    assert stale.any() == (name in ("no feedback", "no SYNC", "late feedback") or ended == "GUARDIAN")
+    syncs = [frame for frame in compiled.log.frames if frame.can_id == SYNC and not frame.received]
+    assert len(syncs) > 40 and [s.data[0] for s in syncs[:40]] == list(range(1, 41))
 
 
 @pytest.fixture

@@ -109,6 +109,49 @@ def test_5_khz_in_time(socketcan: Path, figures: list[str]) -> None:
     assert share >= 0.999
 
 
+def test_sync_by_the_kernel_keeps_its_grid(socketcan: Path, figures: list[str]) -> None:
+    """Its timer starts anew after each expiry: unsteered it would be 3 us late in each period."""
+    run = seen(socketcan, "vcan_kernel_sync")
+    steady(run, "vcan_kernel_sync", figures)
+    syncs = [frame for frame in run.log.frames if frame.can_id == 0x80 and not frame.received]
+    stamps = np.array([frame.t_ns for frame in syncs[:2000]])
+    assert [frame.data[0] for frame in syncs[:240]] == list(range(1, 241))
+    assert abs((stamps[-1] - stamps[0]) / (len(stamps) - 1) - 1e6) < 500.0, "ns a period"
+    assert abs(len(syncs) - len(run.log.ticks)) <= 6
+
+
+def test_the_kernels_sync_dies_with_the_controller(socketcan: Path) -> None:
+    folder = socketcan / "kernel_sync_ends"
+    assert json.loads((folder / "result.json").read_text())["returncode"] == -9
+    before, after = (int((folder / f"{name}.txt").read_text()) for name in ("before", "after"))
+    assert before > 300 and after == before
+
+
+def test_the_guardian_stops_the_drive_of_a_controller_that_stands_still(socketcan: Path) -> None:
+    """SYNC goes on meanwhile, with no command but the stop frames; after SIGCONT nothing is sent at all."""
+    run = seen(socketcan, "kernel_sync_stopped")
+    assert run.result["returncode"] == 1 and run.result["run"]["ended"] == "guardian"
+    commands = [HOUSE.message("COMMAND").decode(data) for can_id, data in run.frames if can_id == 0x201]
+    assert any(abs(c["VoltageQ"]) > 0.0 for c in commands)
+    assert all(c["Controlword"] == 0 and c["VoltageQ"] == 0.0 for c in commands[-5:])
+    states = [
+        HOUSE.message("FEEDBACK").decode(data)["State"] for can_id, data in run.frames if can_id == 0x181
+    ]
+    assert states[-1] == DriveState.SWITCH_ON_DISABLED
+    continued = json.loads((run.folder / "marks.json").read_text())["continued"]
+    later = [can_id for t, can_id, _ in timed_frames_of(run.folder / "candump.log") if t > continued + 0.02]
+    assert not {0x80, 0x201} & set(later)
+
+
+def test_the_kernels_sync_does_not_feed_the_watchdog(socketcan: Path) -> None:
+    run = seen(socketcan, "kernel_sync_watchdog")
+    assert run.result["returncode"] == 1
+    assert run.result["run"]["ended"] in ("drive_fault", "loop_overrun"), run.result
+    emergency = [data for can_id, data in run.frames if can_id == 0x081]
+    assert int.from_bytes(emergency[0][:2], "little") == 0x8130
+    assert_nothing_after_the_stop(run)
+
+
 def test_64_byte_frames_on_vcan(socketcan: Path, figures: list[str]) -> None:
     run = seen(socketcan, "vcan_fd")
     steady(run, "vcan_fd", figures)

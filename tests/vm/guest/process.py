@@ -80,6 +80,7 @@ def warm_up() -> None:
     node[0].warm_up()
     node[1].close()
     compile_kernels(setup)
+    compile_kernels(load_setup(Path(CONFIG), Overrides(settings=('bus.sync="kernel"',))))
     read_in()
 
 

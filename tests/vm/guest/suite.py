@@ -95,6 +95,54 @@ def vcan_5_khz() -> None:
         s.start()
 
 
+KERNEL = ('bus.sync="kernel"',)
+
+
+def vcan_kernel_sync() -> None:
+    """SYNC by the kernel's own timer."""
+    with Scenario("vcan_kernel_sync", settings=KERNEL) as s:
+        s.start()
+
+
+def kernel_sync_ends_with_its_process() -> None:
+    """The drive's watchdog is off, and there is no guardian: the job dies with the controller alone."""
+    own = (*KERNEL, "guardian.enabled=false")
+    with Scenario("kernel_sync_ends", seconds=30.0, plant=("firmware.watchdog_ms=0.0",), settings=own) as s:
+        s.start()
+        s.running()
+        s.run.send_signal(signal.SIGKILL)
+        s.run.wait()
+        time.sleep(0.01)
+        (s.folder / "before.txt").write_text(str(s.dump.read_text().count(" 080#")))
+        time.sleep(0.2)
+        (s.folder / "after.txt").write_text(str(s.dump.read_text().count(" 080#")))
+
+
+def kernel_sync_of_a_stopped_process() -> None:
+    """SYNC goes on, commands do not: the guardian stops the drive, and nothing is sent after SIGCONT."""
+    plant = ("firmware.watchdog_ms=0.0",)
+    with Scenario("kernel_sync_stopped", seconds=30.0, plant=plant, settings=KERNEL) as s:
+        s.start()
+        s.running()
+        s.run.send_signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        (s.folder / "marks.json").write_text(json.dumps({"continued": time.time()}))
+        s.run.send_signal(signal.SIGCONT)
+        s.run.wait()
+
+
+def kernel_sync_of_a_stopped_process_ends_by_the_watchdog() -> None:
+    """Without a guardian: the drive's watchdog is fed by commands alone, not by SYNC."""
+    own = (*KERNEL, "guardian.enabled=false")
+    with Scenario("kernel_sync_watchdog", seconds=30.0, settings=own) as s:
+        s.start()
+        s.running()
+        s.run.send_signal(signal.SIGSTOP)
+        time.sleep(0.15)
+        s.run.send_signal(signal.SIGCONT)
+        s.run.wait()
+
+
 def rehearsal() -> None:
     """Not judged: every page of a run is touched once, so that none is fetched from the host later."""
     with Scenario("rehearsal", seconds=0.5) as s:
@@ -355,6 +403,10 @@ def main() -> int:
         rehearsal,
         vcan_two_processes,
         vcan_5_khz,
+        vcan_kernel_sync,
+        kernel_sync_ends_with_its_process,
+        kernel_sync_of_a_stopped_process,
+        kernel_sync_of_a_stopped_process_ends_by_the_watchdog,
         kvaser_pair,
         vcan_fd,
         vcan_other_drive,
