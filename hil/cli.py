@@ -29,6 +29,7 @@ from hil.commands import (
     replay,
     report,
     run,
+    tune,
     tuning,
     watch,
 )
@@ -60,6 +61,7 @@ Hardware-in-the-loop drive controller on a CAN bus, with a fixed-time disturbanc
   hil design CONFIG            windows and poles for a motor, its noise and a wish
   hil config explain KEY       what a config key means: unit, range, default
   hil identify CONFIG          a motor's parameters with error bars; --from LOG for logged runs
+  hil tune CONFIG              that motor and a wish to a configuration, with its yield
   hil completion bash          completion for the shell; also zsh, tcsh
   hil paper                    everything the paper prints and draws, recomputed
 """
@@ -82,6 +84,7 @@ MODULES = (
     campaign,
     tuning,
     identify,
+    tune,
     config,
 )
 

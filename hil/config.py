@@ -101,7 +101,7 @@ def _includer(base: Path | None) -> Callable[[str], dict[str, Any]]:
 class IdentifiedTable(Table):
     """What ``hil identify`` adds to a motor: from when and what, 95 % intervals by the motor's keys, noise.
 
-    No run reads it.
+    No run reads it; ``hil tune`` does.
     """
 
     date: str
