@@ -232,3 +232,10 @@ def test_what_is_counted_is_bounded() -> None:
         hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
         assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (1024, 1024)
     assert SAFETY_PARAMS["age_max"].shape == (hil.guard.MOST_MESSAGES,)
+
+
+def test_logs_of_before_count_ticks() -> None:
+    guard = Guard(rules=0)
+    guard.t["gap"] = 5
+    hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
+    assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (0, 0)
