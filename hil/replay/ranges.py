@@ -11,7 +11,7 @@ from hil.control.law import N_MAX, ROWS, SPEED
 from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
-from hil.guard import MOST_MESSAGES
+from hil.guard import MOST_MESSAGES, MOST_PERIODS
 from hil.log.named import Record
 from hil.signals import DriveState
 
@@ -28,7 +28,12 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "delay": (0, MOST_DELAY),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
-    "safety_state": {"counter": (0, COUNTERS - 1), "state": (0, max(DriveState))},
+    "safety_state": {
+        "counter": (0, COUNTERS - 1),
+        "state": (0, max(DriveState)),
+        "elapsed": (0, MOST_PERIODS),
+        "gap": (0, MOST_PERIODS),
+    },
     "law_state": {
         "head": (0, N_MAX - 1),
         "gap": (0, MAX_GAP),
