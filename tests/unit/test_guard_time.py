@@ -239,3 +239,29 @@ def test_logs_of_before_count_ticks() -> None:
     guard.t["gap"] = 5
     hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
     assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (0, 0)
+
+
+@pytest.mark.parametrize("name", ["u_q_seen", "u_d_seen"])
+def test_what_another_controller_asks_for_must_be_a_number_where_it_is_read(name: str) -> None:
+    """In a shadow run; a log of before, and a run that sends itself, know nothing of it."""
+    guard = Guard(shadow=1)
+    assert hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+    guard.t[name] = math.nan
+    assert not hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+    for changed in ({"shadow": 0}, {"rules": 0}):
+        for key, value in changed.items():
+            guard.p[key] = value
+        assert hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+        guard.p["shadow"] = guard.p["rules"] = 1
+
+
+@pytest.mark.parametrize("rules", [0, 1])
+def test_the_hotter_of_what_is_there(rules: int) -> None:
+    guard = Guard(rules=rules)
+    found = []
+    for motor, inverter in ((40.0, 50.0), (60.0, 50.0), (math.nan, 50.0), (60.0, math.nan)):
+        guard.t["temperature_motor"], guard.t["temperature_inverter"] = motor, inverter
+        found.append(hil.guard.hottest(guard.p[0], guard.t))
+    assert found[:2] == [50.0, 60.0]
+    if rules:
+        assert found[2:] == [50.0, 60.0]

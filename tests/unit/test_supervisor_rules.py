@@ -294,10 +294,11 @@ def test_which_stops_are_faults(reason: Reason) -> None:
     planned = {Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED, Reason.STALE_FEEDBACK, Reason.LOG_FAILED}
     assert is_fault(int(reason)) is (reason not in planned)
     guard = bench()
-    guard.s["stop_ticks"] = 7
+    guard.s["stop_ticks"], guard.s["stale"], guard.s["stale_at"] = 7, 5, 2
     begin_stop(guard.s[0], int(reason))
     state = DriveState.QUICK_STOP_ACTIVE if reason in planned else DriveState.FAULT_REACTION_ACTIVE
     assert (guard.s["state"][0], guard.s["reason"][0], guard.s["stop_ticks"][0]) == (state, reason, 0)
+    assert (guard.s["stale"][0], guard.s["stale_at"][0]) == (5, 5), "how old the feedback was is told later"
 
 
 def shake(drive: DriveState, armed: int = 1, flags: int = FRESH) -> tuple[int, int, int]:
