@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.frames import EMERGENCY, FRESH
+from drivers.frames import EMERGENCY, FRESH, LENGTH_ERROR
 from drivers.jit import jit
 from drivers.posix import gather
 from drivers.wire import CLASSIC_BYTES, DATA_AT, FD_BYTES, REFUSED, STATE_RAW, encode, find, take
@@ -47,10 +47,13 @@ def refeed(
                     state[0]["got"] = 0
                 elif can_id == ids[1]:  # a clock of lockstep stands still from feedback to command
                     state[0]["last_sent"] = counters[j + (frame["t_ns"] == limits[j])]
-            elif can_id == ids[2] and frame["size"] == 8:
-                code = int(frame["data"][0]) | int(frame["data"][1]) << 8
-                tick[error_at : error_at + 4].view(np.uint32)[0] = code
-                seen |= EMERGENCY if code else 0
+            elif can_id == ids[2]:
+                if frame["size"] == 8:
+                    code = int(frame["data"][0]) | int(frame["data"][1]) << 8
+                    tick[error_at : error_at + 4].view(np.uint32)[0] = code
+                    seen |= EMERGENCY if code else 0
+                else:
+                    seen |= LENGTH_ERROR
             else:
                 size = lay_out(frame, raw)
                 found = take(raw, messages, signals, last, state, words, tick, log, size, late or done, 0)

@@ -205,7 +205,11 @@ def test_a_node_that_is_operational_may_be_a_drive_in_fault(
     assert row.verdict == verdict and ("in FAULT, too" in row.found) == (beat == 5)
     told = beats | {"EMCY": Heard(1, data=bytes.fromhex("3081010000000000"))}
     (row,) = (r for r in traffic_rows(setup, Traffic(told)) if r.check == "drive state")
-    assert row.verdict == "fail" and "0x8130 by its emergency message" in row.found
+    assert (
+        row.verdict == "fail"
+        and "0x8130, life guard" in row.found
+        and "by its emergency message" in row.found
+    )
     gone = beats | {"EMCY": Heard(1, data=bytes(8))}
     assert verdicts(traffic_rows(setup, Traffic(gone)))["drive state"] == "warn"
 

@@ -13,7 +13,7 @@ import hil.guard
 from hil.app import Overrides, Setup, load_setup
 from hil.guard import SAFETY_PARAMS
 from hil.signals import ALL_MISSING, Controlword, DriveState, GuardFlag, Reason, Request, RxFlag, new_ticks
-from hil.supervisor import judge_arming
+from hil.supervisor import judge_arming, note_ages
 from tests.conftest import ROOT
 from tests.safety import Guard
 
@@ -265,3 +265,19 @@ def test_the_hotter_of_what_is_there(rules: int) -> None:
     assert found[:2] == [50.0, 60.0]
     if rules:
         assert found[2:] == [50.0, 60.0]
+
+
+@pytest.mark.parametrize("rules", [0, 1])
+@pytest.mark.parametrize("flags", [0, FRESH])
+def test_a_measurement_has_come_once_it_was_fresh(rules: int, flags: int) -> None:
+    guard = Guard(rules=rules)
+    guard.t["rx_flags"] = flags
+    note_ages(guard.p[0], guard.s[0], guard.t)
+    assert guard.s["came"][0] == (hil.guard.MEASURED if rules and flags else 0)
+
+
+def test_the_first_sight_counts_one_however_long_nothing_was_seen() -> None:
+    """Whether it held in between is not known; afterwards time counts, and a tick at least one period."""
+    assert [hil.guard.grown(0, True, periods) for periods in (0, 1, 5)] == [1, 1, 1]
+    assert [hil.guard.grown(3, True, periods) for periods in (0, 1, 5)] == [4, 4, 8]
+    assert hil.guard.grown(3, False, 5) == 0

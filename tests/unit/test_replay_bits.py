@@ -15,7 +15,7 @@ from hil.log.schema import Records
 from hil.replay import replay, replay_log
 from hil.replay.frames import FrameCheck
 from hil.replay.run import frame_records
-from hil.signals import FIELDS, TickArray, new_ticks
+from hil.signals import FIELDS, RxFlag, TickArray, new_ticks
 from hil.simulate import simulate
 from tests.conftest import CONFIGS
 from tests.golden.kept import LOGS
@@ -168,6 +168,20 @@ def test_a_bit_of_a_sent_payload_is_found(on_the_bus: Log) -> None:
         changed["data"][at, byte] ^= 1 << bit
         first = checked(on_the_bus, on_the_bus.ticks, changed).difference
         assert first is not None, (int(at), byte, bit)
+
+
+@pytest.mark.parametrize(
+    ("data", "flag"), [(bytes(5), RxFlag.LENGTH_ERROR), (b"\x30\x81" + bytes(6), RxFlag.EMERGENCY)]
+)
+def test_an_emergency_counts_by_its_length(on_the_bus: Log, data: bytes, flag: RxFlag) -> None:
+    """As the client judges it: what has not eight bytes says nothing but that."""
+    ticks, before = on_the_bus.ticks.copy(), on_the_bus.frames
+    at = next(i for i, frame in enumerate(before) if frame.t_ns == int(ticks["t_ns"][505]) and frame.received)
+    frames = frame_records([*before[:at], before[at]._replace(can_id=0x81, data=data), *before[at:]])
+    assert checked(on_the_bus, ticks, frames).difference is not None
+    ticks["rx_flags"][505] |= int(flag)
+    ticks["drive_error"][505:510] = 0x8130 if flag == RxFlag.EMERGENCY else 0
+    assert checked(on_the_bus, ticks, frames).difference is None
 
 
 def test_a_changed_command_is_named(on_the_bus: Log) -> None:
