@@ -175,7 +175,8 @@ def halvings_of(A: Array, T: float) -> int:
 
 def condition(a: Array) -> float:
     """|a| |a^-1| in the norm of row sums; nan or inf for a (n, n) that is singular."""
-    both = [math.fsum(abs(float(x)) for x in row) for m in (a, inverse(a)) for row in m]
+    with np.errstate(divide="ignore", invalid="ignore"):  # compiled code divides by 0 without a word
+        both = [math.fsum(abs(float(x)) for x in row) for m in (a, inverse(a)) for row in m]
     return max(both[: len(a)]) * max(both[len(a) :])
 
 
