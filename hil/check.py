@@ -35,7 +35,7 @@ SILENT = "a drive that only answers SYNC can't show it before arming; nothing to
 
 
 def check(setup: Setup) -> list[Row]:
-    """All rows of a configuration; listens for ``drive.heartbeat_timeout_s`` and sends nothing."""
+    """All rows of a configuration; listens for ``drive.heartbeat_timeout_s`` and sends no command."""
     config = setup.config
     return [
         *bus_rows(setup),

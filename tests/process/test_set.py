@@ -6,6 +6,7 @@ import json
 import signal
 import subprocess
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ def wait_for_operation(process: subprocess.Popen[str]) -> None:
     """Until the run is announced and its drive enabled."""
     for _ in range(1200):
         for entry in matching(str(process.pid)):
-            newest = Look(entry).latest(1)
+            with closing(Look(entry)) as look:
+                newest = look.latest(1)
             if len(newest) and newest["state"][-1] == DriveState.OPERATION_ENABLED:
                 return
         time.sleep(0.05)

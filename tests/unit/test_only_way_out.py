@@ -20,6 +20,8 @@ MAY_SEND = {
     ("drivers/client.py", "_transmit"),  # what `send` and `stop` lay out from a guarded tick, and SYNC
     ("drivers/rawlink.py", "send_raw"),  # passes on what the client sends
     ("drivers/lockstep.py", "send"),  # passes on what the client sends
+    ("drivers/sdo.py", "send_message"),  # hil configure, and reads before arming: SDO alone
+    ("drivers/canopen_node.py", "pre_operational"),  # hil configure: takes a node out of operation
     ("hil/app.py", "sending_bus"),  # hil play: recorded frames, onto emulated buses unless allowed
 }
 LINKS = {"drivers/bus.py", "drivers/local.py"}
