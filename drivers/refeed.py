@@ -26,18 +26,19 @@ def lay_out(frame: Any, raw: Any) -> int:
 
 @jit
 def refeed(
-    frames: Any, limits: Any, counters: Any, ids: Any, messages: Any, signals: Any, last: Any, state: Any,
-    words: Any, raw: Any, tick: Any, log: Any, error_at: int, rows: Any, flags: Any,
+    frames: Any, limits: Any, counters: Any, listens: Any, ids: Any, messages: Any, signals: Any, last: Any,
+    state: Any, words: Any, raw: Any, tick: Any, log: Any, error_at: int, rows: Any, flags: Any,
 ) -> int:  # fmt: skip
     """Fill ``rows`` (n, bytes of a tick) and ``flags`` (n) with what n ticks must hold; frames used.
 
     ``limits``: when each tick was computed, on the frames' clock: what came later is another's. ``ids``: SYNC
     that the controller sends (-1: none), its command, the drive's emergency (-1: none). ``counters`` (n + 1):
     of the command before the first tick, then of each tick's; ``tick``: its bytes before the first.
+    ``listens`` (n): ticks that sent no SYNC, since the guardian had stopped the drive.
     """
     at = 0
     for j in range(limits.shape[0]):
-        late, seen, done = ids[0] >= 0, 0, False
+        late, seen, done = ids[0] >= 0 and not listens[j], 0, False
         while at < frames.shape[0] and frames[at]["t_ns"] <= limits[j]:
             frame = frames[at]
             can_id = int(frame["can_id"])

@@ -605,7 +605,7 @@ def _recorded(
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()
-            return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client.odd_length)
+            return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client)
 
 
 @contextlib.contextmanager
@@ -675,7 +675,7 @@ def _run_armed(
     clock: RealClock | LockstepClock,
     request: StopRequest,
     takes: dict[str, tuple[float, float, float]],
-    odd_length: Callable[[], str],
+    client: DriveClient,
 ) -> RunResult:
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
@@ -701,9 +701,11 @@ def _run_armed(
         if asked := who_asked(os.getpid()):
             t_ns, k, who = asked
             recorder.event(t_ns, k, "stop-asked", who)
-        if odd := odd_length():
+        if odd := client.odd_length():
             recorder.event(clock.now_ns(), outcome.ticks + outcome.skipped, "length", odd)
             say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
+        with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
+            client.flush()
         dropped = recorder.dropped
         ended = failure or Reason(outcome.reason).name.lower()
         result: dict[str, Any] = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from hil.faults.matrix import Expect, Stall
 from hil.log.reader import Log
-from hil.signals import DriveState, Reason, TickArray
+from hil.signals import DriveState, Reason, Request, TickArray
 
 AS_EXPECTED, NOT_EXPECTED = "as expected", "not as expected"
 SETTLED_TICKS: Final = 50
@@ -137,6 +137,7 @@ def _judge_stop(
 def _judge_ride(result: Result, expect: Expect, ticks: TickArray) -> None:
     result.reaction = "ride through"
     running = ticks[(ticks["state"] == int(DriveState.OPERATION_ENABLED)) & (ticks["reason"] == 0)]
+    running = running[running["request"] < int(Request.RAMP_DOWN)]  # the ramp to rest is none of the ride
     if expect.reaction == "stop":
         result.why.append("did not stop")
     if len(running) < SETTLED_TICKS or int(ticks["reason"][-1]) != Reason.STOP_REQUESTED:

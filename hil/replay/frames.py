@@ -63,6 +63,7 @@ class FrameCheck:
         self._frames: list[Records] = []
         self._begun = False
         self.done_k = -1
+        self._lockstep = log.metadata.get("run", {}).get("clock") == "lockstep"
         if log.metadata.get("run", {}).get("kind") != "run":
             self.note = "frames not compared: no run on a bus wrote the log"
             return
@@ -132,7 +133,8 @@ class FrameCheck:
             self._tick[:] = ticks[:1]
             self._before = ticks["counter"][:1].astype(np.int64)
         counters = np.concatenate((self._before, ticks["counter"][:count].astype(np.int64)))
-        given: Any = (frames, limits[:count], counters, *self._kernel, rows, flags)
+        listens = (ticks["rx_flags"][:count] & RxFlag.GUARDIAN) != 0
+        given: Any = (frames, limits[:count], counters, listens, *self._kernel, rows, flags)
         used = refeed(*given)
         self._judge(ticks[:count], rows.view(TICK)[:, 0], flags)
         sent = self._sent.compare(ticks[:count], frames[:used], last=until_ns == END_NS)
@@ -148,7 +150,7 @@ class FrameCheck:
         first: tuple[int, str, float, float] | None = None
         known = slice(0 if self._begun else 1, None)
         expected = ticks["rx_flags"].astype(np.int64) & COMPARED_FLAGS
-        odd = np.nonzero((expected != flags & COMPARED_FLAGS)[known])[0]
+        odd = np.nonzero((expected != flags & COMPARED_FLAGS)[known])[0] if self._lockstep else np.empty(0)
         if len(odd):
             row = int(odd[0]) + (known.start or 0)
             first = (row, "rx_flags", float(expected[row]), float(flags[row] & COMPARED_FLAGS))

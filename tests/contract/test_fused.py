@@ -59,7 +59,7 @@ pytestmark = [pytest.mark.compiled, pytest.mark.process]
 
 PERIOD_NS, TIMEOUT_NS = 10_000_000, 5_000_000  # a busy host answers within that
 TICKS = 90
-TURNS = 5
+TURNS = 8
 """A host that stalls for some ms makes two runs differ; so often each may be tried against all others."""
 STATES = {0x0: 1, 0x6: 2, 0x7: 3, 0xF: 4}
 STAMPS = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns"}
