@@ -34,7 +34,6 @@ from drivers.frames import (
     PLACES,
     SEND_FAILED,
     SENT_FIELDS,
-    SOURCES,
 )
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
@@ -61,7 +60,7 @@ from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLED, FAULT_RESET, codes_of, of_controlword, translator
 from drivers.stops import STOP_PAUSE_S, Outgoing, try_all
-from drivers.tables import incoming_tables, outgoing_tables
+from drivers.tables import command_values, incoming_tables, outgoing_tables, sent_offsets
 from drivers.wire import DATA_AT, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
@@ -147,8 +146,7 @@ class DriveClient:
     def _make_senders(self) -> None:
         """What lays out and sends each command and SYNC."""
         messages, signals = outgoing_tables(self.binding)
-        values = np.zeros(len(SOURCES))
-        values[SOURCES.index("load_enable")] = 1.0
+        values = command_values()
         self._values: Any = values.data
         self._commanding = {"values": values, "messages": messages, "signals": signals}
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
@@ -159,8 +157,7 @@ class DriveClient:
         self._sync = None if sync is None else Outgoing(sync, 0)
         if self._sync is not None:
             self._sync.raw[4] = min(self._sync.message.length, 1)
-            noting = (self._log, self._state, self._sync.raw)
-            self._sync.encode = partial(entry(note_sent, *noting, 0), *noting)
+            self._note_when_sent(self._sync)
         self._on_change = dict.fromkeys(self.binding.map.on_change, b"")
         """What of those messages was sent last."""
         self._stops = [self._stop_frames(out) for out in self._outgoing]
@@ -187,9 +184,13 @@ class DriveClient:
             return None
         frame = Outgoing(message, 0)
         frame.view[DATA_AT : DATA_AT + 2] = bytes((command, self.binding.node_id))
+        self._note_when_sent(frame)
+        return frame
+
+    def _note_when_sent(self, frame: Outgoing) -> None:
+        """A frame that is laid out for good: all that is done when it is sent is to log it."""
         noting = (self._log, self._state, frame.raw)
         frame.encode = partial(entry(note_sent, *noting, 0), *noting)
-        return frame
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -218,8 +219,7 @@ class DriveClient:
                 size = len(self._sync.view)
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
             if len(self._outgoing) == 1:
-                fields = np.array([_offset(tick, name) for name in SENT_FIELDS], np.int64)
-                own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": fields}
+                own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": sent_offsets(tick.dtype)}
                 self._command = self._port.commander(own | self._commanding)
         self._tick = tick
 
@@ -500,8 +500,7 @@ class DriveClient:
         """Send a frame that is sent once."""
         frame = Outgoing(shot.message, 0)
         frame.view[DATA_AT : DATA_AT + len(shot.data)] = shot.data
-        noting = (self._log, self._state, frame.raw)
-        frame.encode = partial(entry(note_sent, *noting, 0), *noting)
+        self._note_when_sent(frame)
         self._stop_with(frame)
 
     def _await(self, shot: Shot) -> None:

@@ -191,6 +191,14 @@ def completed(parts: DriveMap, *, lockstep: bool, **facts: Any) -> DriveMap:
     return replace(parts, sync=parts.step if lockstep and not parts.sync else parts.sync, **facts)
 
 
+def map_of(table: Mapping[str, Any] | None, database: Database, where: str, **facts: Any) -> DriveMap:
+    """The map of a configuration's table, :func:`completed`; without one the house protocol's.
+
+    Raises DatabaseError.
+    """
+    return house_map(database) if table is None else completed(map_from_table(table, where), **facts)
+
+
 def house_map(database: Database) -> DriveMap:
     """The map of the house protocol, classic or FD. Raises DatabaseError when the DBC is another one."""
     status = "FEEDBACK" if database.optional("STATUS") is None else "STATUS"

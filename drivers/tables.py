@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from drivers.binding import Binding, Bound
 from drivers.codec import Message
-from drivers.frames import PLACES, STATUS
+from drivers.frames import PLACES, SENT_FIELDS, SOURCES, STATUS
 from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
 from drivers.mapping import MEASURED, RECEIVED
 from drivers.signal import Signal
@@ -100,6 +100,18 @@ def outgoing_tables(binding: Binding) -> tuple[Records, Records]:
         signals = bound.message.signals
         tables.add(bound, [(signals[name], 0, 0, PLACES[part], False) for part, name in bound.parts])
     return tables.records()
+
+
+def command_values() -> npt.NDArray[np.float64]:
+    """Values of a command, in the order of :data:`drivers.frames.SOURCES`; a load is always let on."""
+    values = np.zeros(len(SOURCES))
+    values[SOURCES.index("load_enable")] = 1.0
+    return values
+
+
+def sent_offsets(tick: np.dtype[np.void]) -> npt.NDArray[np.int64]:
+    """Where a tick's fields are that make its command: for :func:`drivers.posix.gather`."""
+    return np.array([tick.fields[name][1] for name in SENT_FIELDS], np.int64)  # type: ignore[index]
 
 
 def laid_out(send_id: int, length: int, fd: bool) -> npt.NDArray[np.uint8]:

@@ -27,7 +27,7 @@ from drivers.errors import DriverError, LinkError
 from drivers.jit import COMPILED
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
-from drivers.mapping import MEASURED, RECEIVED, DriveMap, completed, house_map, map_from_table
+from drivers.mapping import MEASURED, RECEIVED, DriveMap, map_of
 from drivers.signal import Signal
 from drivers.watch import CommandWatch
 from hil import fused, realtime
@@ -134,10 +134,7 @@ class RunResult:
 
 def drive_map(config: RunConfig, database: Database, where: str) -> DriveMap:
     """The configured map of the drive's signals, else the house protocol's. Raises DatabaseError."""
-    table = config.drive.signals
-    if table is None:
-        return house_map(database)
-    return completed(map_from_table(table, f"{where}: drive.signals"), **config.map_facts)
+    return map_of(config.drive.signals, database, f"{where}: drive.signals", **config.map_facts)
 
 
 def wire_facts(binding: Binding) -> WireFacts:

@@ -108,10 +108,15 @@ def true_motor(motor: PlantMotor) -> MotorModel:
     )
 
 
+def own_channel(what: str) -> str:
+    """A channel of the embedded bus that nobody else has."""
+    return f"{what}-{os.getpid()}-{uuid.uuid4().hex[:6]}"
+
+
 def closed_loop(path: Path, overrides: Overrides) -> tuple[Setup, RunResult, Log]:
     """Emulator as a process, controller here, on a bus of their own; the log is read back."""
     if overrides.channel is None:
-        overrides = replace(overrides, channel=f"demo-{os.getpid()}-{uuid.uuid4().hex[:6]}")
+        overrides = replace(overrides, channel=own_channel("demo"))
     setup = load_setup(path, overrides)
     with emulator_process(path, overrides):
         if setup.config.canopen is not None:

@@ -10,11 +10,11 @@ from hil.errors import HilError
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 
 
-def output_file(path: Path, *endings: str) -> Path:
+def output_file(path: Path, *endings: str, config: Path | None = None) -> Path:
     """A file to be written in the end, refused before the work when it can't be. Raises HilError.
 
-    Its name must end in one of ``endings``, and what is there already must be no log: a mistyped line must
-    not write over a measurement.
+    Its name must end in one of ``endings``, and what is there already must be no log, and not the ``config``
+    that the work is for: a mistyped line must not write over a measurement.
     """
     if path.is_dir():
         raise HilError(f"{path}: is a folder; name another file")
@@ -28,6 +28,8 @@ def output_file(path: Path, *endings: str) -> Path:
         raise HilError(f"{path}: can't be written; name another file")
     if path.exists() and _holds_log(path):
         raise HilError(f"{path}: holds a log; name another file")
+    if config is not None and path.resolve() == config.resolve():
+        raise HilError(f"{path}: is the configuration itself; name another file")
     return path
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,7 +13,7 @@ import numpy as np
 from hil import app
 from hil.api.setups import File, Settings, overrides, setup_of, texts
 from hil.app import Setup
-from hil.demo import emulator_process
+from hil.demo import emulator_process, own_channel
 from hil.log.check import seal
 from hil.log.reader import Log, open_log
 from hil.log.schema import meanings, units
@@ -77,8 +75,7 @@ def run(config: Setup | File, settings: Settings = (), *, arm: bool = False, emu
 
 def _apart(setup: Setup) -> Setup:
     """The same on a channel of the embedded bus that nobody else has."""
-    channel = f"hil-{os.getpid()}-{uuid.uuid4().hex[:6]}"
-    bus = setup.config.bus.model_copy(update={"interface": "hil-local", "channel": channel})
+    bus = setup.config.bus.model_copy(update={"interface": "hil-local", "channel": own_channel("hil")})
     return app.setup_of(setup.path, setup.config.model_copy(update={"bus": bus}))
 
 

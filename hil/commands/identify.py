@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import sys
-import uuid
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,16 +64,11 @@ def cmd_identify(args: argparse.Namespace) -> int:
 
 def _output(args: argparse.Namespace) -> Path:
     """Where the motor goes. Raises HilError before anything is done."""
-    from hil.errors import HilError
-
     path = args.output
     if path is None:
         stem = args.config.stem if args.config else f"{args.logs[0].stem}-motor"
         path = output_folder(Path("logs/identify")) / f"{stem}.toml"
-    found = output_file(path, ".toml")
-    if args.config and found.resolve() == args.config.resolve():
-        raise HilError(f"{found}: is the configuration itself; name another file")
-    return found
+    return output_file(path, ".toml", config=args.config)
 
 
 def _write(file: Path, text: str) -> str | None:
@@ -106,7 +99,9 @@ def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
 
     names, given = chosen(args.steps), overrides(args)
     if args.emulated and given.channel is None:
-        given = replace(given, channel=f"identify-{os.getpid()}-{uuid.uuid4().hex[:6]}")
+        from hil.demo import own_channel
+
+        given = replace(given, channel=own_channel("identify"))
     setup = load_setup(args.config, given)
     checked(args.config, setup.config)
     emulated = is_emulated_bus(setup.config)

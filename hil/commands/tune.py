@@ -51,15 +51,12 @@ def _cases(text: str) -> int:
 def cmd_tune(args: argparse.Namespace) -> int:
     """Tune."""
     _lean()
-    from hil.errors import HilError
     from hil.identify.tune import at_motor, tune, written
     from hil.tuning.design import Wish
     from hil.view import key_values, progress, show
 
     to = args.output or args.config.with_name(f"{args.config.stem}-tuned.toml")
-    to = output_file(to, ".toml")
-    if to.resolve() == args.config.resolve():
-        raise HilError(f"{to}: is the configuration itself; name another file")
+    to = output_file(to, ".toml", config=args.config)
     wish = Wish(
         args.u_noise_mv,
         args.ms,

@@ -176,7 +176,6 @@ def cmd_compare(args: argparse.Namespace) -> int:
 def cmd_design(args: argparse.Namespace) -> int:
     """Design windows and poles."""
     _lean()
-    from hil.errors import HilError
     from hil.tuning.design import WINDOWS, Wish, design
     from hil.tuning.page import front_picture
     from hil.tuning.tables import design_table
@@ -185,9 +184,7 @@ def cmd_design(args: argparse.Namespace) -> int:
     path = args.output
     if path is None:
         path = output_folder(Path("logs/design")) / f"{args.config.stem}.toml"
-    path = output_file(path, ".toml")
-    if path.resolve() == args.config.resolve():
-        raise HilError(f"{path}: is the configuration itself; name another file")
+    path = output_file(path, ".toml", config=args.config)
     laws = (
         WINDOWS if args.law is None else tuple(name.strip() for name in args.law.split(",") if name.strip())
     )

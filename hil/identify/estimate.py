@@ -83,6 +83,20 @@ class Estimate:
     samples: Samples | None = None
     fit: Fit | None = None
 
+    @property
+    def tells(self) -> bool:
+        """True when the data tell any parameter."""
+        return any(p.told for p in self.parameters.values())
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "parameters": {name: p.as_dict() for name, p in self.parameters.items()},
+            "findings": self.findings,
+            "faults": self.faults,
+            "white": self.white,
+        }
+
     def put(self, name: str, value: float, half: float, why: str = "") -> None:
         """Note a parameter with its half-width."""
         self.parameters[name] = Parameter(value, value - half, value + half, UNITS[name], not why, why)

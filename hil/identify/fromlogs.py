@@ -89,13 +89,10 @@ def from_logs(paths: Sequence[Path]) -> tuple[dict[str, Any], Estimate, MotorTab
     if len(runs) > 1:
         whole = estimate([run.ticks for run in runs], 1.0 / last.loop.rate_hz, motor_model(last.motor))
     result = {
-        "parameters": {name: p.as_dict() for name, p in whole.parameters.items()},
+        **whole.as_dict(),
         "logs": [str(run.path) for run in runs],
         "runs": [run.as_dict() for run in runs],
         "drift": drift(runs),
-        "findings": whole.findings,
-        "faults": whole.faults,
-        "white": whole.white,
-        "ok": not whole.faults and any(p.told for p in whole.parameters.values()),
+        "ok": not whole.faults and whole.tells,
     }
     return result, whole, motor_of(whole, last.motor), last

@@ -64,17 +64,15 @@ class Session:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form."""
-        parameters = {name: p.as_dict() for name, p in self.estimate.parameters.items()}
         return {
+            **self.estimate.as_dict(),
             "config": str(self.path),
-            "parameters": parameters,
             "steps": self.steps,
             "logs": self.logs,
             "findings": self.findings + self.estimate.findings,
             "faults": self.faults,
-            "white": self.estimate.white,
             "motor_s": sum(row.get("motor_s", 0.0) for row in self.steps),
-            "ok": not self.faults and any(p.told for p in self.estimate.parameters.values()),
+            "ok": not self.faults and self.estimate.tells,
         }
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from drivers.binding import Binding, bind
 from drivers.codec import Database
 from drivers.errors import DriverError
-from drivers.mapping import RECEIVED, completed, house_map, map_from_table
+from drivers.mapping import RECEIVED, map_of
 from drivers.refeed import refeed
 from drivers.tables import incoming_tables
 from drivers.wire import FRAME, STATE
@@ -46,10 +46,7 @@ def binding_of(log: Log) -> tuple[Binding, RunConfig]:
     except (KeyError, ValueError, TypeError, RecursionError) as error:
         raise HilError(f"{error}") from error
     database = Database(Path("drive.dbc"), config.drive.node_id, config.drive.node_rule, text)
-    table = config.drive.signals
-    parts = house_map(database)
-    if table is not None:
-        parts = completed(map_from_table(table, "drive.signals"), **config.map_facts)
+    parts = map_of(config.drive.signals, database, "drive.signals", **config.map_facts)
     return bind(parts, database, load=config.controller.kind == "fac"), config
 
 
@@ -91,7 +88,6 @@ class FrameCheck:
         if binding.map.states:
             names -= {"drive_state"}  # translated step by step from states of its own
         self._sent = SentCheck(binding)
-        self._before = np.empty(0, np.int64)
         self._names = sorted(names & (set(_KINDS) - log.absent))
 
     def feed(self, kind: str, records: Records) -> None:
@@ -131,15 +127,14 @@ class FrameCheck:
         flags = np.zeros(count, np.int64)
         if not self._begun:  # what came before the first tick is not known
             self._tick[:] = ticks[:1]
-            self._before = ticks["counter"][:1].astype(np.int64)
-        counters = np.concatenate((self._before, ticks["counter"][:count].astype(np.int64)))
+        before = self._sent.last if self._begun else ticks[:1]
+        counters = np.concatenate((before["counter"], ticks["counter"][:count])).astype(np.int64)
         listens = (ticks["rx_flags"][:count] & RxFlag.GUARDIAN) != 0
         given: Any = (frames, limits[:count], counters, listens, *self._kernel, rows, flags)
         used = refeed(*given)
         self._judge(ticks[:count], rows.view(TICK)[:, 0], flags)
         sent = self._sent.compare(ticks[:count], frames[:used], last=until_ns == END_NS)
         self.difference = earliest(self.difference, sent)
-        self._before = counters[-1:]
         self.done_k = int(ticks["k"][count - 1])
         self._begun, self._ticks, self._frames = True, [ticks[count:]], [frames[used:]]
         self._frames = [part for part in self._frames if len(part)]

@@ -11,9 +11,8 @@ import numpy as np
 
 from drivers.binding import MOST_COUNTS, Binding
 from drivers.errors import DriverError
-from drivers.frames import SENT_FIELDS, SOURCES
 from drivers.refeed import resend
-from drivers.tables import outgoing_tables
+from drivers.tables import command_values, outgoing_tables, sent_offsets
 from drivers.wire import DATA_AT, FRAME, STATE
 from hil.log.schema import Records
 from hil.replay.fold import ulp_between
@@ -32,27 +31,23 @@ _FIELD_OF = {
 
 
 class SentCheck:
-    """Compares a run's commands tick by tick; keeps the last tick for the frames of the next block."""
+    """Compares a run's commands tick by tick; the next block's first frames follow the tick ``last``."""
 
     def __init__(self, binding: Binding) -> None:
         self._binding = binding
-        self._last = np.empty(0, TICK)
+        self.last: TickArray = np.empty(0, TICK)
         messages, signals = outgoing_tables(binding)
-        values, self._raw = np.zeros(len(SOURCES)), np.zeros(128, np.uint8)
-        values[SOURCES.index("load_enable")] = 1.0
-        assert TICK.fields is not None  # noqa: S101 - a record has fields
-        fields = np.array([TICK.fields[name][1] for name in SENT_FIELDS], np.int64)
-        self._ids = messages["id"]
+        self._ids, self._raw = messages["id"], np.zeros(128, np.uint8)
         self._given: Any = (
-            fields, values, messages, signals, np.zeros(1, STATE), np.zeros(2, np.uint32), self._raw,
-            np.zeros(0, FRAME),
+            sent_offsets(TICK), command_values(), messages, signals, np.zeros(1, STATE),
+            np.zeros(2, np.uint32), self._raw, np.zeros(0, FRAME),
         )  # fmt: skip
         self._stops = new_ticks(MOST_COUNTS)
         self._stops["counter"] = np.arange(MOST_COUNTS)
 
     def compare(self, ticks: TickArray, frames: Records, last: bool) -> Difference | None:
         """The first of these ``ticks`` whose frames say something else; ``last``: no tick follows them."""
-        ticks = np.concatenate((self._last, ticks))
+        ticks = np.concatenate((self.last, ticks))
         if not len(ticks):
             return None
         frames = frames[(frames["received"] == 0) & np.isin(frames["can_id"], self._ids)]
@@ -61,7 +56,7 @@ class SentCheck:
         for at in np.nonzero(self._wrong(frames, owners, ticks))[0]:
             if not (last and owners[at] == len(ticks) - 1 and self._is_stop(frames[at : at + 1])):
                 return self._difference(ticks[owners[at] : owners[at] + 1], frames[at : at + 1])
-        self._last = ticks[-1:].copy()
+        self.last = ticks[-1:].copy()
         return None
 
     def _wrong(self, frames: Records, owners: Any, ticks: TickArray) -> Any:

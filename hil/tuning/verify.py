@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import uuid
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from hil.app import Overrides, load_setup, run
-from hil.demo import emulator_process
+from hil.demo import emulator_process, own_channel
 from hil.log.reader import open_log
 from hil.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, corner_settings, seen_in
@@ -36,8 +34,8 @@ def plants_of(bench: Any) -> dict[str, list[str]]:
 
 def on_the_bus(path: Path, overrides: Overrides, plant: list[str]) -> Any:
     """The ticks of a lockstep run with the emulator as a process."""
-    channel = f"verify-{os.getpid()}-{uuid.uuid4().hex[:6]}"
-    overrides = replace(overrides, channel=channel, settings=(*overrides.settings, 'loop.clock="lockstep"'))
+    lockstep = (*overrides.settings, 'loop.clock="lockstep"')
+    overrides = replace(overrides, channel=own_channel("verify"), settings=lockstep)
     with emulator_process(path, overrides, tuple(plant)):
         result = run(load_setup(path, overrides))
     return open_log(Path(result.log)).ticks
