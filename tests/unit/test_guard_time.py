@@ -281,3 +281,12 @@ def test_the_first_sight_counts_one_however_long_nothing_was_seen() -> None:
     assert [hil.guard.grown(0, True, periods) for periods in (0, 1, 5)] == [1, 1, 1]
     assert [hil.guard.grown(3, True, periods) for periods in (0, 1, 5)] == [4, 4, 8]
     assert hil.guard.grown(3, False, 5) == 0
+
+
+@pytest.mark.parametrize("shadow", [0, 1])
+def test_a_shadow_run_waits_for_a_slow_message_that_does_not_come(shadow: int) -> None:
+    guard = Guard(shadow=shadow, messages=1, age_max=3)
+    guard.t["rx_flags"], guard.t["request"] = FRESH, int(Request.ARM)
+    guard.s["age"] = 4
+    found = judge_arming(guard.p[0], guard.s[0], guard.t)
+    assert found == (Reason.NONE if shadow else Reason.STALE_STATUS)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -259,6 +259,26 @@ class Guarded:
         self.drive = GuardedDrive(self.port, self.words, lambda: self.now_ns)
         self.drive.prepare(self.tick)
         assert self.port.called.pop() == "prepare"
+
+
+class Clockwork:
+    """What sends SYNC in the loop's place: it is stopped or it is not."""
+
+    stopped = 0
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+def test_once_the_guardian_has_fired_nothing_sends_sync_in_the_loops_place() -> None:
+    g, timed = Guarded(), Clockwork()
+    drive: Any = GuardedDrive(g.port, g.words, lambda: g.now_ns, cast("Any", timed))
+    drive.prepare(g.tick)
+    drive.receive(g.tick, 123)
+    assert timed.stopped == 0
+    g.cells[Word.FIRED] = 1
+    drive.receive(g.tick, 123)
+    assert timed.stopped == 1
 
 
 def test_a_tick_beats_and_is_passed_on() -> None:
