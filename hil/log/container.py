@@ -2,11 +2,14 @@
 
 The mcap package's own writer works message by message in Python (5 to 10 us each); here the messages of a
 chunk come as arrays, so that a whole block of ticks costs about as much as its compression. A record is
-appended whole or not at all: after a failed write the file is cut back to its last whole record.
+appended whole or not at all: after a failed write the file is cut back to its last whole record. The disk
+space of summary and footer is taken before each chunk is written, so that a full disk leaves a complete file.
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import os
 import struct
@@ -52,6 +55,24 @@ HEAD_BYTES: Final = 31
 FIXED_BYTES: Final = 22
 """Bytes of a message record that its length counts besides the data."""
 _INDEX: Final = np.dtype([("time", "<u8"), ("offset", "<u8")])
+SUMMARY_BYTES: Final = 32 * 1024
+"""Room for the last metadata, the summary without its chunks, and the footer."""
+CHUNK_INDEX_BYTES: Final = 256
+"""At most what a chunk adds to the summary."""
+ROOM_STEP: Final = 64 * 1024
+KEEP_SIZE: Final = 1  # FALLOC_FL_KEEP_SIZE, linux/falloc.h
+NOT_THERE: Final = (errno.EOPNOTSUPP, errno.ENOSYS)
+_fallocate: Final = ctypes.CDLL(None, use_errno=True).fallocate64
+_fallocate.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_int64, ctypes.c_int64]
+
+
+def take_room(fd: int, at: int, size: int) -> None:
+    """Take disk space beyond a file's end; its size stays. Without effect where the file system can't.
+
+    Raises OSError when there is not that much. Source: fallocate(2).
+    """
+    if _fallocate(fd, KEEP_SIZE, at, size) != 0 and (number := ctypes.get_errno()) not in NOT_THERE:
+        raise OSError(number, os.strerror(number))
 
 
 def encode(record: McapRecord) -> bytes:
@@ -104,7 +125,7 @@ class Container:
         self.compression, self._compress = compression, compressor(compression)
         self._fd = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
         self._own = os.fstat(self._fd)
-        self.size = 0
+        self.size = self._room = 0
         self._schemas: list[McapRecord] = []
         self._channels: list[McapRecord] = []
         self._chunks: list[McapRecord] = []
@@ -127,6 +148,13 @@ class Container:
             raise
         self.size += len(data)
         return at
+
+    def _make_room(self, size: int) -> None:
+        """Take the disk space of ``size`` bytes and of all that :meth:`finish` will write after them."""
+        needed = self.size + size + SUMMARY_BYTES + CHUNK_INDEX_BYTES * (len(self._chunks) + 1)
+        if needed > self._room:
+            take_room(self._fd, self._room, needed + ROOM_STEP - self._room)
+            self._room = needed + ROOM_STEP
 
     def add_schema(self, name: str, data: bytes) -> int:
         """Write a protobuf schema; return its id."""
@@ -182,6 +210,7 @@ class Container:
         )
         record = encode(chunk)
         indexes, places = self._indexes(channels, times, offsets)
+        self._make_room(len(record) + len(indexes))
         at = self._append(record + indexes)
         self._chunks.append(
             ChunkIndex(
@@ -274,7 +303,9 @@ class Container:
             raise FileNotFoundError(errno.ENOENT, f"{path} was deleted or moved")
 
     def close(self) -> None:
-        """Close the file as it is; closing twice is harmless."""
+        """Close the file as it is, give back the space it did not need; closing twice is harmless."""
         if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self.size)
             os.close(self._fd)
             self._fd = -1
