@@ -41,6 +41,11 @@ def jit(function: Function) -> Function:
     return cast(Function, _cached(compiled(function)))
 
 
+def inlined(function: Function) -> Function:
+    """:func:`jit` for a function made at run time, which only kernels call: it is kept as a part of those."""
+    return cast(Function, numba.njit(fastmath=False, error_model="numpy", forceinline=True)(function))
+
+
 def waiting(function: Function) -> Function:
     """:func:`jit` for a kernel that waits: other threads of Python's run meanwhile."""
     return cast(Function, _cached(numba.njit(nogil=True, error_model="numpy")(function)))

@@ -2,8 +2,9 @@
 
 numba's own cache looks at the file of a function, not at those of the functions that it calls: an old
 callee would live on inside a new caller. Here a kernel is as old as the sources that its module imports,
-directly or not, within this project: a change compiles what depends on it, and nothing else. A kernel has one
-set of files whatever line it stands on, so what is out of date is overwritten and nothing needs cleaning up.
+directly or not, within this project: a change compiles what depends on it, and nothing else. What a registry
+finds stands in no import: it names those files itself (:func:`rests_on`). A kernel has one set of files
+whatever line it stands on, so what is out of date is overwritten and nothing needs cleaning up.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import functools
 import hashlib
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,12 +39,29 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hil-drive" / "numba"
 
 
+_FOUND: Final[dict[Path, frozenset[Path]]] = {}
+"""Files that a registry has found, by the registry's own."""
+
+
+def rests_on(registry: str, files: Iterable[Path]) -> None:
+    """Count ``files`` as imported by the file ``registry``, for the kernels made from now on.
+
+    Of a package outside this project all that lies beside the file counts too, since a kernel may call it.
+    """
+    found = {path.resolve() for path in files}
+    for path in [path for path in found if not path.is_relative_to(ROOT)]:
+        if path.with_name("__init__.py").is_file():
+            found |= set(path.parent.rglob("*.py"))
+    _FOUND[Path(registry).resolve()] = frozenset(found)
+
+
 @functools.cache
 def sources(path: Path) -> frozenset[Path]:
     """The file and all files of this project that it imports, directly or not."""
     found, left = {path}, [path]
     while left:
-        new = _imported(left.pop()) - found
+        file = left.pop()
+        new = (_imported(file) | _FOUND.get(file, frozenset())) - found
         found |= new
         left += new
     return frozenset(found)

@@ -5,32 +5,21 @@ Reading the file is left to the caller; this module knows only what a plant cons
 
 from __future__ import annotations
 
-import math
+import typing
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationInfo, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
-from firmware_model.current import gains
 from firmware_model.faults import ExtraLoad, Fault
-from firmware_model.load import coupler_torque_max
-from firmware_model.plant import MAX_LOADS, PARAMS, SAMPLE, STATE, LoadKind, State, Takes
+from firmware_model.loads.step import StepLoad
+from firmware_model.plant import MAX_LOADS, PARAMETERS, PARAMS, SAMPLE, STATE, State, code_of
+from firmware_model.registry import loads
+from firmware_model.tables import Finite, NonNegative, Positive, Table
 
-Positive = Annotated[float, Field(ge=1e-12, le=1e9, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
-"""Ranges of physical quantities: no product or square of a few of them overflows or vanishes."""
-Since = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
-"""Times [s] whose nanoseconds are whole numbers with room to spare."""
 Record = npt.NDArray[np.void]
-
-
-class Table(BaseModel):
-    """Base of all tables: frozen, unknown keys refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class PlantMotor(Table):
@@ -52,6 +41,11 @@ class PlantMotor(Table):
     """Moment of inertia J of motor and load together."""
     B_f_n_m_s: NonNegative = 0.0
     """Viscous friction B_f: torque over mechanical speed."""
+
+    @property
+    def k_t_n_m_a(self) -> float:
+        """Torque over i_q without reluctance: 1.5 n_p psi_f."""
+        return 1.5 * self.n_p * self.psi_f_wb
 
 
 class Inverter(Table):
@@ -110,6 +104,11 @@ class Friction(Table):
             raise ValueError("static_n_m is the larger one: at least coulomb_n_m")
         return self
 
+    @property
+    def most_n_m(self) -> float:
+        """T_s."""
+        return self.coulomb_n_m if self.static_n_m is None else self.static_n_m
+
 
 class Sensors(Table):
     """Standard deviation of the noise on speed and currents; resolution and range are the wire's."""
@@ -153,89 +152,12 @@ class Firmware(Table):
     """By what the drive makes a current of a torque; left out: the motor's own constant."""
 
 
-class ConstantLoad(Table):
-    """A constant torque."""
-
-    kind: Literal["constant"]
-    torque_n_m: Finite
-    """Torque, positive against positive speed."""
-
-
-class StepLoad(Table):
-    """A torque from one time until another."""
-
-    kind: Literal["step"]
-    torque_n_m: Finite
-    """Torque, positive against positive speed."""
-    at_s: Since
-    """When it comes [plant time]."""
-    until_s: Since | None = None
-    """When it goes; left out: never."""
-
-    @model_validator(mode="after")
-    def _in_order(self) -> StepLoad:
-        if self.until_s is not None and self.until_s <= self.at_s:
-            raise ValueError(f"until_s = {self.until_s} is not after at_s = {self.at_s}")
-        return self
-
-
-class BrakeLoad(Table):
-    """A brake: dry friction from one time until another; it holds the shaft and never drives it."""
-
-    kind: Literal["brake"]
-    torque_n_m: NonNegative
-    """Torque of the brake while it slides; it holds up to this."""
-    at_s: NonNegative = 0.0
-    """When it closes [plant time]."""
-    until_s: Positive | None = None
-    """When it opens; left out: never."""
-
-    @model_validator(mode="after")
-    def _in_order(self) -> BrakeLoad:
-        if self.until_s is not None and self.until_s <= self.at_s:
-            raise ValueError(f"until_s = {self.until_s} is not after at_s = {self.at_s}")
-        return self
-
-
-class SineLoad(Table):
-    """A sinusoidal torque."""
-
-    kind: Literal["sine"]
-    torque_n_m: Finite
-    """Amplitude."""
-    frequency_hz: Positive
-    """Frequency."""
-    phase_rad: Finite = 0.0
-    """Phase at plant time 0."""
-
-
-class FanLoad(Table):
-    """T = k w |w|."""
-
-    kind: Literal["fan"]
-    k_n_m_s2: Positive
-    """Coefficient k of w |w|."""
-
-
-class CouplerLoad(Table):
-    """Permanent-magnet eddy-current coupler; the air gap sets its torque."""
-
-    kind: Literal["coupler"]
-    torque_at_zero_gap_n_m: Positive
-    """Largest torque over slip speed, at no air gap."""
-    gap_mm: NonNegative
-    """Air gap."""
-    decay_length_mm: Positive
-    """Air gap over which the field falls to 1/e: pole pitch / pi."""
-    slip_at_max_rad_s: Positive
-    """Slip speed at which the torque is largest."""
-    other_side_rad_s: Finite = 0.0
-    """Speed of the coupler's other side."""
-
-
-Load = Annotated[
-    ConstantLoad | StepLoad | BrakeLoad | SineLoad | FanLoad | CouplerLoad, Field(discriminator="kind")
-]
+if typing.TYPE_CHECKING:
+    Load = Any
+else:
+    _TABLES = tuple(member.table for member in loads().values())
+    Load = Annotated[typing.Union[_TABLES], Field(discriminator="kind")]  # noqa: UP007 - of a tuple
+    """A load: a table of each registered kind (:mod:`firmware_model.loads`)."""
 
 
 class Disturbance(Table):
@@ -289,9 +211,9 @@ class PlantConfig(Table):
     """Dry friction of the shaft."""
     disturbance: Disturbance = Disturbance()
     """Unknown constants of (33)."""
-    load: Annotated[list[Load], Field(max_length=MAX_LOADS)] = []
+    load: list[Load] = Field(default=[], max_length=MAX_LOADS)
     """Load torques on the shaft; they add up."""
-    fault: list[Fault] = []
+    fault: list[Fault] = Field(default=[])
     """What goes wrong, and when."""
     black_box: bool = False
     """Keep what the drive did for hil faults to judge."""
@@ -327,93 +249,16 @@ class Wire:
     i_d_top: float
 
 
-def _load_row(load: Any) -> tuple[int, float, float, float]:
-    """Kind and the parameters a, b, c of one load, as :data:`firmware_model.plant.PARAMS` says."""
-    if isinstance(load, ConstantLoad):
-        return int(LoadKind.CONSTANT), load.torque_n_m, 0.0, 0.0
-    if isinstance(load, (StepLoad, BrakeLoad)):
-        kind = LoadKind.BRAKE if isinstance(load, BrakeLoad) else LoadKind.STEP
-        return int(kind), load.torque_n_m, load.at_s, load.until_s or math.inf
-    if isinstance(load, SineLoad):
-        return int(LoadKind.SINE), load.torque_n_m, load.frequency_hz, load.phase_rad
-    if isinstance(load, FanLoad):
-        return int(LoadKind.FAN), load.k_n_m_s2, 0.0, 0.0
-    top = coupler_torque_max(load.torque_at_zero_gap_n_m, load.gap_mm, load.decay_length_mm)
-    return int(LoadKind.COUPLER), top, load.slip_at_max_rad_s, load.other_side_rad_s
-
-
-def _current_loop(motor: PlantMotor, firmware: Firmware) -> dict[str, float]:
-    """The drive's own current loop, where it has one."""
-    takes = Takes[firmware.takes.upper()]
-    if not takes:
-        return {}
-    T, b = firmware.current_period_us * 1e-6, firmware.current_loop_rad_s
-    (gain_q, reset_q), (gain_d, reset_d) = (gains(motor.R_s_ohm, L, b, T) for L in (motor.L_q_h, motor.L_d_h))
-    return {
-        "takes": int(takes),
-        "pll": firmware.speed_pll_rad_s,
-        "drive_k_t": firmware.torque_constant_n_m_a or 1.5 * motor.n_p * motor.psi_f_wb,
-        "i_limit": firmware.i_limit_a or math.inf,
-        "current_ns": firmware.current_period_us * 1000,
-        "gain_q": gain_q,
-        "gain_d": gain_d,
-        "reset_q": reset_q,
-        "reset_d": reset_d,
-    }
-
-
 def build_params(config: PlantConfig, wire: Wire) -> Record:
     """The parameter record of a plant: a one-element array of PARAMS."""
     p = np.zeros(1, PARAMS)
-    motor, firmware, inverter, friction = config.motor, config.firmware, config.inverter, config.friction
-    values: dict[str, float] = {
-        "R_s": motor.R_s_ohm,
-        "L_d": motor.L_d_h,
-        "L_q": motor.L_q_h,
-        "psi_f": motor.psi_f_wb,
-        "n_p": motor.n_p,
-        "J": motor.J_kg_m2,
-        "B_f": motor.B_f_n_m_s,
-        "phi_w": config.disturbance.phi_w_rad_s2,
-        "phi_q": config.disturbance.phi_q_a_s,
-        "substep_ns": config.substep_us * 1000,
-        "v_dc": inverter.v_dc_v,
-        "u_lsb": inverter.resolution_v,
-        "w_lsb": wire.w_lsb,
-        "i_q_lsb": wire.i_q_lsb,
-        "i_d_lsb": wire.i_d_lsb,
-        "w_top": wire.w_top,
-        "i_q_top": wire.i_q_top,
-        "i_d_top": wire.i_d_top,
-        "w_noise": config.sensors.w_noise_rad_s,
-        "i_noise": config.sensors.i_noise_a,
-        "watchdog_ns": round(firmware.watchdog_ms * 1e6),
-        "i_trip": firmware.i_trip_a,
-        "w_trip": firmware.w_trip_rad_s,
-        "temperature_trip": firmware.temperature_trip_c,
-        "ambient": firmware.ambient_c,
-        "thermal_resistance": firmware.thermal_resistance_k_w,
-        "thermal_time": firmware.thermal_time_s,
-        "status_every": firmware.status_every,
-        "seed": config.seed,
-        "coulomb": friction.coulomb_n_m,
-        "static": friction.coulomb_n_m if friction.static_n_m is None else friction.static_n_m,
-        "stribeck": friction.stribeck_rad_s,
-        "capacitance": inverter.capacitance_f or 0.0,
-        "rectifier": inverter.rectifier_ohm,
-        "brake_resistance": inverter.brake_ohm or math.inf,
-        "brake_on": inverter.brake_on_v or math.inf,
-        "brake_off": inverter.brake_off_v or 0.0,
-        "v_trip": inverter.v_dc_trip_v or math.inf,
-    } | _current_loop(motor, firmware)
-    for name, value in values.items():
-        p[name] = value
-    for j, load in enumerate(config.all_loads):
-        p["load_kind"][0, j], p["load_a"][0, j], p["load_b"][0, j], p["load_c"][0, j] = _load_row(load)
-    p["loads"] = len(config.all_loads)
-    kinds = p["load_kind"]
-    p["varying"] = int(((kinds > LoadKind.STEP) & (kinds < LoadKind.BRAKE)).any())
-    p["rubs"] = int(bool(p["static"][0] > 0.0) or bool((kinds == LoadKind.BRAKE).any()))
+    for name, row in PARAMETERS.items():
+        value = row.of(config, wire)
+        p[name] = np.inf if value is None else value
+    for record, load in zip(p["load"][0], config.all_loads, strict=False):
+        record["kind"] = code_of(load.kind)
+        for name, number in loads()[load.kind].values(load).items():
+            record[name] = number
     return p
 
 

@@ -17,12 +17,6 @@ from firmware_model.link import link_voltage
 from firmware_model.plant import Takes
 
 
-def gains(R_s: float, L: float, bandwidth: float, T: float) -> tuple[float, float]:
-    """(k [V/A], 1 - a) of one axis."""
-    reset = -math.expm1(-R_s * T / L)
-    return -math.expm1(-bandwidth * T) * R_s / reset, reset
-
-
 @jit
 def refer(p: Any, s: Any) -> None:
     """The references [A] of the newest command, within the drive's own limit."""

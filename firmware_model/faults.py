@@ -9,21 +9,13 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
-Positive = Annotated[float, Field(ge=1e-12, le=1e9, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
-"""Ranges of physical quantities: no product or square of a few of them overflows or vanishes."""
-Since = Annotated[float, Field(ge=0, le=1e7, allow_inf_nan=False)]
-Span = Annotated[float, Field(ge=1e-9, le=1e7, allow_inf_nan=False)]
-"""Times [s] whose nanoseconds are whole numbers with room to spare."""
+from firmware_model.tables import Finite, NonNegative, Positive, Since, Span, Table
 
 
-class FaultTable(BaseModel):
+class FaultTable(Table):
     """What all faults have: a beginning and a length."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     at_s: Since
     """When it begins [plant time]."""

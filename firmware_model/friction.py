@@ -11,7 +11,8 @@ import math
 from typing import Any
 
 from firmware_model.jit import jit
-from firmware_model.plant import SLIDE, STRIBECK, LoadKind
+from firmware_model.load import level_of
+from firmware_model.plant import SLIDE, STRIBECK
 
 
 @jit
@@ -19,8 +20,7 @@ def level(p: Any, t: float) -> float:
     """T_c with the brakes that are on at t [s]."""
     total = p["coulomb"]
     for j in range(p["loads"]):
-        if p["load_kind"][j] == LoadKind.BRAKE and p["load_b"][j] <= t < p["load_c"][j]:
-            total += p["load_a"][j]
+        total += level_of(p["load"][j], t)
     return float(total)
 
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from drivers.jit import COMPILED, array_at, entry, jit, places_of, waiting
+from drivers.jit import COMPILED, array_at, entry, inlined, jit, places_of, waiting
 
-__all__ = ["COMPILED", "array_at", "entry", "jit", "places_of", "waiting"]
+__all__ = ["COMPILED", "array_at", "entry", "inlined", "jit", "places_of", "waiting"]

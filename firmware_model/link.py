@@ -12,8 +12,8 @@ import math
 from typing import Any
 
 from firmware_model.jit import jit
-from firmware_model.plant import INVERSE, LINK, ORDER, POWER
-from firmware_model.series import evaluate, first_crossing, product, shifted, within
+from firmware_model.plant import INVERSE, LINK, POWER
+from firmware_model.series import ORDER, evaluate, first_crossing, product, shifted, within
 
 LINK_ERROR_V = 1e-7
 """Last term of the series that a step may have [V]."""

@@ -18,30 +18,9 @@ from typing import Any
 
 from firmware_model.friction import level, stribeck_coefficient
 from firmware_model.jit import jit
-from firmware_model.load import load_coefficient, one_load
-from firmware_model.plant import DRIVE, ORDER, SLIDE, LoadKind
-from firmware_model.series import evaluate, products
-
-
-@jit
-def constant_load(p: Any, t: float) -> float:
-    """Sum of the loads that are constant over the substep about its middle t [s]."""
-    total = 0.0
-    for j in range(p["loads"]):
-        if p["load_kind"][j] <= LoadKind.STEP:
-            total += one_load(p["load_kind"][j], p["load_a"][j], p["load_b"][j], p["load_c"][j], t, 0.0)
-    return total
-
-
-@jit
-def varying_load(p: Any, c: Any, t: float, k: int) -> float:
-    """Coefficient k of the sum of the loads that vary; each load's own goes to its row of ``c``."""
-    total = 0.0
-    for j in range(p["loads"]):
-        if LoadKind.STEP < p["load_kind"][j] < LoadKind.BRAKE:
-            c[3 + j, k] = load_coefficient(p, c, j, t, k)
-            total += c[3 + j, k]
-    return total
+from firmware_model.load import held_load, varying_load
+from firmware_model.plant import DRIVE, SLIDE
+from firmware_model.series import ORDER, evaluate, products
 
 
 @jit
@@ -58,7 +37,7 @@ def series(
     k_t, reluctance = 1.5 * n_p * p["psi_f"], 1.5 * n_p * (L_d - L_q)
     w, q, d = c[0], c[1], c[2]
     w[0], q[0], d[0] = x[0], x[1], x[2]
-    T_constant = constant_load(p, t + 0.5 * h) + T_commanded
+    T_constant = held_load(p, t + 0.5 * h) + T_commanded
     slide, T_coulomb = (c[SLIDE, 0], level(p, t + 0.5 * h)) if p["rubs"] else (1.0, 0.0)
     for k in range(ORDER):
         share = 1.0 / (k + 1)

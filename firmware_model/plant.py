@@ -1,18 +1,23 @@
 """Records of the emulated drive: everything its kernels read (parameters) and change (state).
 
-One-element structured arrays of fixed shape, so that one compiled cache serves every configuration.
+One-element structured arrays of fixed shape, so that one compiled cache serves every configuration. A
+parameter is one row of ``PARAMETERS``, a load one file of :mod:`firmware_model.loads`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
+from firmware_model.gains import gains
+from firmware_model.registry import loads
+from firmware_model.series import ORDER
+
 MAX_LOADS: Final = 8
-ORDER: Final = 8
-"""Order of the motor's Taylor series."""
 SLIDE: Final = 3 + MAX_LOADS
 """Row of the series' room that holds which way the shaft slides: -1, 1, or 0 while it sticks."""
 DRIVE, STRIBECK, LINK, INVERSE, POWER = range(SLIDE + 1, SLIDE + 6)
@@ -55,85 +60,104 @@ class Takes(IntEnum):
     TORQUE = 2
 
 
-class LoadKind(IntEnum):
-    """Kinds of load torque; several add up."""
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """A field of ``PARAMS``: what it is of a PlantConfig and a Wire, its type, its unit."""
 
-    NONE = 0
-    CONSTANT = 1
-    STEP = 2
-    SINE = 3
-    FAN = 4
-    COUPLER = 5
-    BRAKE = 6
+    of: Callable[[Any, Any], float | None]
+    """None: there is none, which is as good as infinite."""
+    unit: str = ""
+    type: str = "f8"
 
 
-PARAMS: Final = np.dtype(
-    [
-        ("R_s", "f8"),
-        ("L_d", "f8"),
-        ("L_q", "f8"),
-        ("psi_f", "f8"),
-        ("n_p", "f8"),
-        ("J", "f8"),
-        ("B_f", "f8"),
-        ("phi_w", "f8"),
-        ("phi_q", "f8"),
-        ("substep_ns", "i8"),
-        ("v_dc", "f8"),
-        ("u_lsb", "f8"),
-        ("w_lsb", "f8"),
-        ("i_q_lsb", "f8"),
-        ("i_d_lsb", "f8"),
-        ("w_top", "f8"),
-        ("i_q_top", "f8"),
-        ("i_d_top", "f8"),
-        ("w_noise", "f8"),
-        ("i_noise", "f8"),
-        ("watchdog_ns", "i8"),
-        ("i_trip", "f8"),
-        ("w_trip", "f8"),
-        ("temperature_trip", "f8"),
-        ("ambient", "f8"),
-        ("thermal_resistance", "f8"),
-        ("thermal_time", "f8"),
-        ("status_every", "i8"),
-        ("seed", "i8"),
-        ("loads", "i8"),
-        ("varying", "i8"),
-        ("load_kind", "i8", MAX_LOADS),
-        ("load_a", "f8", MAX_LOADS),
-        ("load_b", "f8", MAX_LOADS),
-        ("load_c", "f8", MAX_LOADS),
-        ("load_d", "f8", MAX_LOADS),
-        ("rubs", "i8"),
-        ("coulomb", "f8"),
-        ("static", "f8"),
-        ("stribeck", "f8"),
-        ("capacitance", "f8"),
-        ("rectifier", "f8"),
-        ("brake_resistance", "f8"),
-        ("brake_on", "f8"),
-        ("brake_off", "f8"),
-        ("v_trip", "f8"),
-        ("takes", "i8"),
-        ("drive_k_t", "f8"),
-        ("i_limit", "f8"),
-        ("current_ns", "i8"),
-        ("gain_q", "f8"),
-        ("gain_d", "f8"),
-        ("reset_q", "f8"),
-        ("reset_d", "f8"),
-        ("pll", "f8"),
-    ],
-    align=True,
-)
-"""Motor, inverter, sensors, firmware and loads. SI units; ``*_lsb`` 0 means no rounding.
+def _loop(of: Callable[[Any], float | None]) -> Callable[[Any, Any], float | None]:
+    """A number of the drive's own current loop; 0 for a drive that takes a voltage and has none."""
+    return lambda config, wire: 0.0 if config.firmware.takes == "voltage" else of(config)
 
-Loads use a..d as: constant (T); step (T, from, until); sine (T, frequency, phase); fan (k);
-coupler (T_max, slip at T_max, speed of the other side); brake (T, from, until). ``rubs`` 0: no friction, no
-brake; ``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage. ``takes``:
-what a command is (:class:`Takes`); gains [V/A] and shares of reset of the sampled current loop.
+
+def _gains(config: Any, L: float) -> tuple[float, float]:
+    """Gain [V/A] and share of reset of one axis."""
+    firmware = config.firmware
+    T = firmware.current_period_us * 1e-6
+    return gains(config.motor.R_s_ohm, L, firmware.current_loop_rad_s, T)
+
+
+PARAMETERS: Final = {
+    "R_s": Parameter(lambda c, w: c.motor.R_s_ohm, "ohm"),
+    "L_d": Parameter(lambda c, w: c.motor.L_d_h, "H"),
+    "L_q": Parameter(lambda c, w: c.motor.L_q_h, "H"),
+    "psi_f": Parameter(lambda c, w: c.motor.psi_f_wb, "Wb"),
+    "n_p": Parameter(lambda c, w: c.motor.n_p),
+    "J": Parameter(lambda c, w: c.motor.J_kg_m2, "kg m2"),
+    "B_f": Parameter(lambda c, w: c.motor.B_f_n_m_s, "N m s"),
+    "phi_w": Parameter(lambda c, w: c.disturbance.phi_w_rad_s2, "rad/s2"),
+    "phi_q": Parameter(lambda c, w: c.disturbance.phi_q_a_s, "A/s"),
+    "substep_ns": Parameter(lambda c, w: c.substep_us * 1000, "ns", "i8"),
+    "v_dc": Parameter(lambda c, w: c.inverter.v_dc_v, "V"),
+    "u_lsb": Parameter(lambda c, w: c.inverter.resolution_v, "V"),
+    "w_lsb": Parameter(lambda c, w: w.w_lsb, "rad/s"),
+    "i_q_lsb": Parameter(lambda c, w: w.i_q_lsb, "A"),
+    "i_d_lsb": Parameter(lambda c, w: w.i_d_lsb, "A"),
+    "w_top": Parameter(lambda c, w: w.w_top, "rad/s"),
+    "i_q_top": Parameter(lambda c, w: w.i_q_top, "A"),
+    "i_d_top": Parameter(lambda c, w: w.i_d_top, "A"),
+    "w_noise": Parameter(lambda c, w: c.sensors.w_noise_rad_s, "rad/s"),
+    "i_noise": Parameter(lambda c, w: c.sensors.i_noise_a, "A"),
+    "watchdog_ns": Parameter(lambda c, w: round(c.firmware.watchdog_ms * 1e6), "ns", "i8"),
+    "i_trip": Parameter(lambda c, w: c.firmware.i_trip_a, "A"),
+    "w_trip": Parameter(lambda c, w: c.firmware.w_trip_rad_s, "rad/s"),
+    "temperature_trip": Parameter(lambda c, w: c.firmware.temperature_trip_c, "degC"),
+    "ambient": Parameter(lambda c, w: c.firmware.ambient_c, "degC"),
+    "thermal_resistance": Parameter(lambda c, w: c.firmware.thermal_resistance_k_w, "K/W"),
+    "thermal_time": Parameter(lambda c, w: c.firmware.thermal_time_s, "s"),
+    "status_every": Parameter(lambda c, w: c.firmware.status_every, "", "i8"),
+    "seed": Parameter(lambda c, w: c.seed, "", "i8"),
+    "loads": Parameter(lambda c, w: len(c.all_loads), "", "i8"),
+    "varying": Parameter(lambda c, w: has(c, "coefficient"), "", "i8"),
+    "rubs": Parameter(lambda c, w: c.friction.most_n_m > 0.0 or has(c, "level"), "", "i8"),
+    "coulomb": Parameter(lambda c, w: c.friction.coulomb_n_m, "N m"),
+    "static": Parameter(lambda c, w: c.friction.most_n_m, "N m"),
+    "stribeck": Parameter(lambda c, w: c.friction.stribeck_rad_s, "rad/s"),
+    "capacitance": Parameter(lambda c, w: c.inverter.capacitance_f or 0.0, "F"),
+    "rectifier": Parameter(lambda c, w: c.inverter.rectifier_ohm, "ohm"),
+    "brake_resistance": Parameter(lambda c, w: c.inverter.brake_ohm, "ohm"),
+    "brake_on": Parameter(lambda c, w: c.inverter.brake_on_v, "V"),
+    "brake_off": Parameter(lambda c, w: c.inverter.brake_off_v or 0.0, "V"),
+    "v_trip": Parameter(lambda c, w: c.inverter.v_dc_trip_v, "V"),
+    "takes": Parameter(lambda c, w: Takes[c.firmware.takes.upper()], "", "i8"),
+    "drive_k_t": Parameter(_loop(lambda c: c.firmware.torque_constant_n_m_a or c.motor.k_t_n_m_a), "N m/A"),
+    "i_limit": Parameter(_loop(lambda c: c.firmware.i_limit_a), "A"),
+    "current_ns": Parameter(_loop(lambda c: c.firmware.current_period_us * 1000), "ns", "i8"),
+    "gain_q": Parameter(_loop(lambda c: _gains(c, c.motor.L_q_h)[0]), "V/A"),
+    "gain_d": Parameter(_loop(lambda c: _gains(c, c.motor.L_d_h)[0]), "V/A"),
+    "reset_q": Parameter(_loop(lambda c: _gains(c, c.motor.L_q_h)[1])),
+    "reset_d": Parameter(_loop(lambda c: _gains(c, c.motor.L_d_h)[1])),
+    "pll": Parameter(_loop(lambda c: c.firmware.speed_pll_rad_s), "rad/s"),
+}
+"""Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
+
+``*_lsb`` 0: no rounding. ``varying``: a load changes within a substep; ``rubs`` 0: no friction, no brake;
+``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage. ``takes``: what a
+command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop.
 """
+_NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
+LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)
+"""One load: its code and, by name, every number that any load of the registry has."""
+PARAMS: Final = np.dtype(
+    [*((name, row.type) for name, row in PARAMETERS.items()), ("load", LOAD, (MAX_LOADS,))], align=True
+)
+"""``PARAMETERS``, and the loads, of which the first ``loads`` are there. SI units."""
+
+
+def code_of(kind: str) -> int:
+    """What a load's record has for its kind, in this process."""
+    return list(loads()).index(kind)
+
+
+def has(config: Any, kernel: str) -> bool:
+    """True when one of the plant's loads has that kernel."""
+    return any(getattr(loads()[load.kind], kernel) is not None for load in config.all_loads)
+
 
 STATE: Final = np.dtype(
     [

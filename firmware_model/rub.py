@@ -15,8 +15,8 @@ from firmware_model.jit import jit
 from firmware_model.link import advance_link
 from firmware_model.load import load_torque
 from firmware_model.motor import series
-from firmware_model.plant import DRIVE, ORDER, POWER, SLIDE, STRIBECK
-from firmware_model.series import evaluate, first_crossing, within
+from firmware_model.plant import DRIVE, POWER, SLIDE, STRIBECK
+from firmware_model.series import ORDER, evaluate, first_crossing, within
 
 W_ERROR = 1e-10
 """Last term of the series of w [rad/s], and of the Stribeck exponential, that a step may have."""

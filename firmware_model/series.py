@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 from firmware_model.jit import jit
-from firmware_model.plant import ORDER
+
+ORDER: Final = 8
+"""Order of the motor's Taylor series."""
 
 
 @jit

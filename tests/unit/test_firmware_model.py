@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 
 from firmware_model import drive, load, motor, sensors
 from firmware_model.config import PlantConfig, Record, Wire, build_params, new_sample, new_state
+from firmware_model.loads.coupler import coupler_torque_max
 from firmware_model.plant import ErrorCode, State
 
 WIRE = Wire(0.01, 327.67, 0.001, 32.767, 0.01, 20.47)
@@ -60,7 +61,7 @@ def test_series_follows_dop853_under_every_kind_of_load() -> None:
         {"kind": "fan", "k_n_m_s2": 1e-4},
         COUPLER | {"slip_at_max_rad_s": 20.0, "other_side_rad_s": 5.0},
     ]
-    top = load.coupler_torque_max(6.0, 3.0, 6.0)
+    top = coupler_torque_max(6.0, 3.0, 6.0)
 
     def T_L(t: float, w: float) -> float:
         slip = (w - 5.0) / 20.0
