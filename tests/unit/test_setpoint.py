@@ -11,7 +11,18 @@ import pytest
 
 from hil.app import Overrides, load_setup
 from hil.control.errors import ControlDesignError
+from hil.control.law import FAC
+from hil.control.references import reference_at
 from hil.design import Machine
+from hil.setpoint import (
+    begin_ramp,
+    follow,
+    new_setpoint_state,
+    no_setpoint,
+    ramp_over,
+    ramped,
+    stepped,
+)
 from hil.setpoint_design import acceleration_max, setpoint_params, stop_rate
 from hil.signals import DriveState, Request, new_ticks
 from hil.simulate import simulate_ticks
@@ -162,6 +173,112 @@ def test_a_simulated_run_ends_at_rest_and_without_a_ramp_as_it_always_did() -> N
     assert abs(ended["w"][0]) < 1.5 and int(ended["k"][0]) == pytest.approx(2533, abs=40)
     down = ramped[ramped["request"] == Request.RAMP_DOWN]
     assert (np.abs(down["w"] - down["w_ref"]) < 6.0).all() and (down["state"] == OPERATING).all()
+
+
+def rule(**values: float) -> tuple[Any, Any]:
+    """Parameters and state with these numbers, all others 0, T_s = 0.5 s."""
+    p, g = no_setpoint(), new_setpoint_state()
+    assert len(p) == len(g) == 1
+    p["T_s"] = 0.5
+    for name, value in values.items():
+        (p if name in (p.dtype.names or ()) else g)[name] = value
+    return p[0], g[0]
+
+
+def test_a_step_is_bounded_on_either_side() -> None:
+    assert [stepped(1.0, target, 0.25) for target in (9.0, 1.125, 1.0, 0.875, -9.0)] == [
+        1.25, 1.125, 1.0, 0.875, 0.75,
+    ]  # fmt: skip
+
+
+def test_live_set_points_go_at_their_rate_times_the_periods() -> None:
+    p, g = rule(w_rate=4.0, i_q_rate=2.0, w=10.0, i_q=1.0, w_target=99.0, i_q_target=9.0)
+    assert follow(p, g, 7.0, 0.5, 3.0, 2) == (7.0, 0.5, 3.0)
+    g["live_w"] = 1
+    assert follow(p, g, 7.0, 0.5, 3.0, 3) == (16.0, 4.0, 3.0)
+    g["w_target"] = -99.0
+    assert follow(p, g, 7.0, 0.5, 3.0, 1) == (8.0, -4.0, 3.0)
+    g["w_target"] = 10.0
+    assert follow(p, g, 7.0, 0.5, 3.0, 1) == (10.0, 0.0, 3.0)
+    g["w_target"] = 12.5
+    assert follow(p, g, 7.0, 0.5, 3.0, 1) == (12.0, 4.0, 3.0)
+    g["w_target"] = 7.5
+    assert follow(p, g, 7.0, 0.5, 3.0, 1) == (8.0, -4.0, 3.0)
+    g["live_w"], g["live_i_q"] = 0, 1
+    assert follow(p, g, 7.0, 0.5, 3.0, 3) == (7.0, 0.5, 4.0)
+    g["i_q_target"] = -9.0
+    assert follow(p, g, 7.0, 0.5, 3.0, 1) == (7.0, 0.5, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("w", "measured", "start"),
+    [(5.0, 3.0, 3.0), (5.0, 7.0, 5.0), (5.0, -1.0, 0.0), (0.0, 3.0, 0.0), (-5.0, -3.0, -3.0),
+     (-5.0, -7.0, -5.0), (-5.0, 1.0, 0.0), (5.0, math.nan, 5.0), (5.0, -math.inf, 5.0),
+     (-5.0, math.inf, -5.0), (0.5, 0.25, 0.25), (-0.5, -0.25, -0.25)],
+)  # fmt: skip
+def test_a_ramp_begins_between_rest_and_the_reference(w: float, measured: float, start: float) -> None:
+    _, g = rule(ticks=9, at_zero=9, i_q_from=9.0)
+    begin_ramp(g, w, 2.5, measured)
+    assert (g["ramping"], g["ticks"], g["at_zero"], g["w_from"], g["i_q_from"]) == (1, 0, 0, start, 2.5)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_current_shrinks_with_the_speed_of_the_ramp(sign: float) -> None:
+    p, g = rule(stop_rate=4.0, w_from=sign * 10.0, i_q_from=5.0)
+    assert ramped(p, g) == (sign * 10.0, -sign * 4.0, 5.0)
+    g["ticks"] = 3
+    assert ramped(p, g) == (sign * 4.0, -sign * 4.0, 2.0)
+    g["ticks"] = 5
+    assert ramped(p, g) == (0.0, 0.0, 0.0)
+    p["stop_rate"], g["w_from"], g["ticks"] = 0.25, sign * 0.75, 2
+    assert ramped(p, g) == (sign * 0.5, -sign * 0.25, 5.0 * 0.5 / 0.75)
+
+
+def test_a_ramp_is_over_at_rest_after_settling_or_in_the_end() -> None:
+    p, g = rule(w_still=0.5, settle_ticks=6, stop_ticks=20, ticks=19)
+    assert not ramp_over(p, g, 0.25, 0.0, 1) and g["at_zero"] == 0
+    assert [ramp_over(p, g, 0.0, measured, 1) for measured in (0.5, -0.5, 0.75, -0.75)] == [1, 1, 0, 0]
+    assert g["at_zero"] == 4 and not ramp_over(p, g, 0.0, 9.0, 2) and ramp_over(p, g, 0.0, 9.0, 1)
+    assert not ramp_over(p, g, 0.25, 0.0, 3) and g["at_zero"] == 0
+    g["ticks"] = 20
+    assert ramp_over(p, g, 0.25, 0.0, 1)
+
+
+def test_a_current_of_the_profile_is_asked_for_by_the_law_fac_alone() -> None:
+    bench = Bench()
+    bench.machine.reference["i_q"] = 2.0
+    bench.tick(Request.ARM, 80.0)
+    assert bench.t["i_q_ref_in"] == 0.0
+    bench.machine.law["kind"] = FAC
+    bench.tick(Request.ARM, 80.0)
+    assert bench.t["i_q_ref_in"] == 2.0
+    state = bench.machine.setpoint_state[0]
+    assert (state["w"], state["i_q"]) == (80.0, 2.0)
+
+
+def test_the_profile_runs_with_the_time_in_operation() -> None:
+    bench = Bench()
+    for run_ticks in (0, 100, 300, 600):
+        w, dw = reference_at(bench.machine.reference[0], run_ticks * 1e-3)
+        assert bench.tick(Request.ARM, 0.0, run_ticks=run_ticks)[:2] == (w, dw)
+    assert 0.0 < w < 80.0 and dw > 0.0
+
+
+def test_a_ramp_of_one_tick_is_one() -> None:
+    bench = Bench()
+    bench.machine.setpoint["stop_ticks"] = 1
+    bench.tick(Request.ARM, 80.0)
+    assert [bench.tick(Request.STOP, 80.0)[2] for _ in range(2)] == [Request.RAMP_DOWN, Request.STOP]
+
+
+def test_the_ramp_counts_from_the_tick_after_its_first() -> None:
+    bench = Bench()
+    bench.tick(Request.ARM, 80.0)
+    bench.tick(Request.STOP, 80.0, gap=7)
+    state = bench.machine.setpoint_state[0]
+    assert (state["ramping"], state["ticks"]) == (1, 0)
+    bench.tick(Request.ARM, 80.0, gap=3)  # nobody takes a stop back
+    assert state["ticks"] == 3 and bench.t["request"] == Request.ARM
 
 
 def test_parameters_are_of_the_config_alone() -> None:
