@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.loads.step import StepLoad
-from firmware_model.plant import MAX_LOADS, PARAMETERS, PARAMS, SAMPLE, STATE, State, code_of
+from firmware_model.plant import MAX_LOADS, MOST_SLOTS, PARAMETERS, PARAMS, SAMPLE, STATE, State, code_of
 from firmware_model.registry import loads
 from firmware_model.tables import Finite, NonNegative, Positive, Table
 
@@ -119,6 +119,52 @@ class Sensors(Table):
     """Noise of the measured currents, standard deviation."""
 
 
+class FirstOrderFilter(Table):
+    """The speed through a first-order lag."""
+
+    kind: Literal["first-order"]
+    pole_rad_s: Positive
+    """Pole p of y' = p (w - y)."""
+
+
+class PllFilter(Table):
+    """The speed by a PLL of two real poles p, q: y'' + (p + q) y' + p q y = p q w."""
+
+    kind: Literal["pll"]
+    pole_1_rad_s: Positive
+    """First pole; of gains k_p, k_i it is (k_p - (k_p^2 - 4 k_i)^1/2) / 2."""
+    pole_2_rad_s: Positive
+    """Second pole, (k_p + (k_p^2 - 4 k_i)^1/2) / 2; a critically damped PLL has both alike."""
+
+
+class MovingAverageFilter(Table):
+    """The mean speed over a window: the angle turned in it over its length."""
+
+    kind: Literal["moving-average"]
+    window_ms: Positive
+    """Length of the window; a multiple of current_period_us, up to 1024 of them."""
+
+
+class NoFilter(Table):
+    """The speed as it is."""
+
+    kind: Literal["none"]
+
+
+def _a_table(value: Any) -> Any:
+    """A filter is a table; a name alone says too little."""
+    if isinstance(value, (Table, dict)):
+        return value
+    raise ValueError('must be a table, as { kind = "first-order", pole_rad_s = 1000.0 }')
+
+
+Filters = Annotated[
+    FirstOrderFilter | PllFilter | MovingAverageFilter | NoFilter,
+    Field(discriminator="kind"),
+    BeforeValidator(_a_table),
+]
+
+
 class Firmware(Table):
     """Protection of the drive itself."""
 
@@ -145,11 +191,36 @@ class Firmware(Table):
     current_period_us: Annotated[int, Field(ge=1, le=100_000)] = 50
     """Sample time of the drive's own current loop."""
     speed_pll_rad_s: NonNegative = 0.0
-    """Bandwidth of the critically damped PLL that the drive's speed comes from; 0: none."""
+    """Bandwidth of the critically damped PLL that the drive's speed comes from; 0: none. Short for a
+    speed_filter of kind pll whose poles are alike."""
+    speed_filter: Filters = NoFilter(kind="none")
+    """What the drive's speed comes through."""
     i_limit_a: Positive | None = None
     """Limit of the current that the drive's own loop is asked for; left out: none."""
     torque_constant_n_m_a: Positive | None = None
     """By what the drive makes a current of a torque; left out: the motor's own constant."""
+
+    @property
+    def filtered_by(self) -> FirstOrderFilter | PllFilter | MovingAverageFilter | NoFilter:
+        """What the drive's speed comes through, however it is given."""
+        if pole := self.speed_pll_rad_s:
+            return PllFilter(kind="pll", pole_1_rad_s=pole, pole_2_rad_s=pole)
+        return self.speed_filter
+
+    @model_validator(mode="after")
+    def _one_filter(self) -> Firmware:
+        if self.speed_pll_rad_s and not isinstance(self.speed_filter, NoFilter):
+            raise ValueError(
+                "speed_pll_rad_s and speed_filter: the speed comes through one of them; keep one"
+            )
+        if isinstance(self.speed_filter, MovingAverageFilter):
+            slots = self.speed_filter.window_ms * 1e3 / self.current_period_us
+            if not (1 <= round(slots) <= MOST_SLOTS and abs(slots - round(slots)) < 1e-6 * slots):
+                raise ValueError(
+                    f"speed_filter.window_ms = {self.speed_filter.window_ms:g}: no multiple of "
+                    f"current_period_us = {self.current_period_us} from 1 to {MOST_SLOTS} of them"
+                )
+        return self
 
 
 if typing.TYPE_CHECKING:

@@ -29,20 +29,6 @@ def refer(p: Any, s: Any) -> None:
 
 
 @jit
-def track(p: Any, s: Any, w: float, h: float) -> None:
-    """Move the speed's PLL on by h [s], over which the shaft turned with w on average.
-
-    v'' + 2 b v' + b^2 v = b^2 w, its closed form: e = v - w, c = v' + b e;  e(h) = (e + c h) e^{-b h},
-    v'(h) = (v' - b c h) e^{-b h}.
-    """
-    b = p["pll"]
-    e, decay = s["pll_w"] - w, math.exp(-b * h)
-    c = s["pll_rate"] + b * e
-    s["pll_w"] = w + (e + c * h) * decay
-    s["pll_rate"] = (s["pll_rate"] - b * c * h) * decay
-
-
-@jit
 def regulate(p: Any, s: Any) -> None:
     """One sample of the loop: the voltage that holds until the next."""
     w, i_q, i_d = s["x"]

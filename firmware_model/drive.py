@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_model.current import refer, regulate, track
+from firmware_model.current import refer, regulate
 from firmware_model.jit import jit
 from firmware_model.link import link_voltage
 from firmware_model.load import edge_after, load_torque
@@ -21,6 +21,7 @@ from firmware_model.motor import move
 from firmware_model.plant import PROTOCOL_VERSION, ErrorCode, State
 from firmware_model.rub import friction_torque, rub
 from firmware_model.sensors import measure, whole_degrees
+from firmware_model.speedfilter import track
 
 
 @jit
@@ -90,15 +91,17 @@ def advance(p: Any, s: Any, dt_ns: int) -> None:
             step = min(step, p["current_ns"] - s["t_ns"] % p["current_ns"])
             if on and s["t_ns"] % p["current_ns"] == 0:
                 regulate(p, s)
+        if p["slot_ns"] > 0:
+            step = min(step, p["slot_ns"] - s["t_ns"] % p["slot_ns"])
         h = step * 1e-9
         before = s["x"][0]
         if p["rubs"] or p["capacitance"] > 0.0:
             rub(p, s, s["t_ns"] * 1e-9, h, on)
         else:
             move(p, s["x"], s["series"], s["t_ns"] * 1e-9, h, s["u_q"], s["u_d"], s["T_commanded"], on)
-        if p["pll"] > 0.0:
-            track(p, s, 0.5 * (before + s["x"][0]), h)
         s["t_ns"] += step
+        if p["filter"] > 0:
+            track(p, s, before, s["x"][0], h)
         left -= step
         protect(p, s)  # first, so that no absurd current heats the motor
         heat(p, s, h)
@@ -187,7 +190,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
         s["fed_ns"] = 0
     latch(p, s)
     x = s["x"]
-    out["w"] = measure(s, s["pll_w"] if p["pll"] > 0.0 else x[0], p["w_noise"], p["w_lsb"], p["w_top"])
+    out["w"] = measure(s, s["seen_w"] if p["filter"] > 0 else x[0], p["w_noise"], p["w_lsb"], p["w_top"])
     out["i_q"] = measure(s, x[1], p["i_noise"], p["i_q_lsb"], p["i_q_top"])
     out["i_d"] = measure(s, x[2], p["i_noise"], p["i_d_lsb"], p["i_d_top"])
     out["echo"], out["state"], out["limited"] = s["echo"], s["state"], s["limited"]

@@ -60,6 +60,19 @@ class Takes(IntEnum):
     TORQUE = 2
 
 
+class Filter(IntEnum):
+    """What the reported speed comes through."""
+
+    NONE = 0
+    FIRST_ORDER = 1
+    PLL = 2
+    MEAN = 3
+
+
+MOST_SLOTS: Final = 1024
+"""Samples of the longest moving average."""
+
+
 @dataclass(frozen=True, slots=True)
 class Parameter:
     """A field of ``PARAMS``: what it is of a PlantConfig and a Wire, its type, its unit."""
@@ -80,6 +93,25 @@ def _gains(config: Any, L: float) -> tuple[float, float]:
     firmware = config.firmware
     T = firmware.current_period_us * 1e-6
     return gains(config.motor.R_s_ohm, L, firmware.current_loop_rad_s, T)
+
+
+def _filter(name: str) -> Callable[[Any, Any], float | None]:
+    """A number of what the speed comes through; 0 where that has none such."""
+    return lambda config, wire: _speed_filter(config.firmware).get(name, 0)
+
+
+def _speed_filter(firmware: Any) -> dict[str, float]:
+    """Kind and numbers of what the speed comes through."""
+    given, period = firmware.filtered_by, firmware.current_period_us
+    if given.kind == "first-order":
+        return {"filter": Filter.FIRST_ORDER, "pole_1": given.pole_rad_s}
+    if given.kind == "pll":
+        slow, fast = sorted((given.pole_1_rad_s, given.pole_2_rad_s))
+        return {"filter": Filter.PLL, "pole_1": slow, "pole_2": fast}
+    if given.kind == "moving-average":
+        slots = round(given.window_ms * 1e3 / period)
+        return {"filter": Filter.MEAN, "slot_ns": period * 1000, "slots": slots}
+    return {}
 
 
 PARAMETERS: Final = {
@@ -132,13 +164,18 @@ PARAMETERS: Final = {
     "gain_d": Parameter(_loop(lambda c: _gains(c, c.motor.L_d_h)[0]), "V/A"),
     "reset_q": Parameter(_loop(lambda c: _gains(c, c.motor.L_q_h)[1])),
     "reset_d": Parameter(_loop(lambda c: _gains(c, c.motor.L_d_h)[1])),
-    "pll": Parameter(_loop(lambda c: c.firmware.speed_pll_rad_s), "rad/s"),
+    "filter": Parameter(_filter("filter"), "", "i8"),
+    "pole_1": Parameter(_filter("pole_1"), "rad/s"),
+    "pole_2": Parameter(_filter("pole_2"), "rad/s"),
+    "slot_ns": Parameter(_filter("slot_ns"), "ns", "i8"),
+    "slots": Parameter(_filter("slots"), "", "i8"),
 }
 """Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
 
 ``*_lsb`` 0: no rounding. ``varying``: a load changes within a substep; ``rubs`` 0: no friction, no brake;
 ``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage. ``takes``: what a
-command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop.
+command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop; ``filter`` is of
+the speed (:class:`Filter`), with its poles, or the samples of a mean and their period.
 """
 _NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
 LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)
@@ -191,14 +228,17 @@ STATE: Final = np.dtype(
         ("d_ref", "f8"),
         ("q_total", "f8"),
         ("d_total", "f8"),
-        ("pll_w", "f8"),
-        ("pll_rate", "f8"),
+        ("seen_w", "f8"),
+        ("seen_rate", "f8"),
+        ("angle", "f8"),
+        ("angles", "f8", MOST_SLOTS),
+        ("slot", "i8"),
     ],
     align=True,
 )
 """x = (w, i_q, i_d), room for its series and those of the loads; plant time from the first SYNC;
 latched and pending command; CiA 402 state; references [A] and integrators [V] of the current loop;
-speed and its rate by the PLL.
+speed and its rate by the filter, the shaft's angle and a ring of its past.
 """
 
 SAMPLE: Final = np.dtype(

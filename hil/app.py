@@ -38,6 +38,7 @@ from hil.control.registry import laws
 from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errorcodes import words
 from hil.errors import ArmingError, ConfigError, HilError
+from hil.filtered import refuse_unstable
 from hil.guardian import GuardedDrive, Rights, Words, guardian
 from hil.inbox import Inbox, ranges
 from hil.log.origin import origin, package_version
@@ -202,7 +203,10 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     _check_command(path, config)
     carried = {config.command.keys[0]: wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
     check_limits(str(path), config.limits, shown, carried)
-    return Setup(path, config, database, binding, wire, build(config, wire), out_of_reach(config, wire))
+    machine = build(config, wire)
+    if config.drive.takes != "voltage":
+        refuse_unstable(str(path), config, machine, wire.x_lsb[0])
+    return Setup(path, config, database, binding, wire, machine, out_of_reach(config, wire))
 
 
 def _check_command(path: Path, config: RunConfig) -> None:

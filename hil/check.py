@@ -18,8 +18,10 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
+from hil.emulate import load_plant
 from hil.errorcodes import words
-from hil.errors import HilError, plain
+from hil.errors import ConfigError, HilError, plain
+from hil.filtered import filter_rows
 from hil.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.signals import DriveState
 
@@ -40,6 +42,7 @@ def check(setup: Setup) -> list[Row]:
     return [
         *bus_rows(setup),
         *reach_rows(setup),
+        *speed_filter_rows(setup),
         load_row(setup),
         *heard_rows(setup),
         *canopen_rows(setup),
@@ -55,6 +58,18 @@ def reach_rows(setup: Setup) -> list[Row]:
         return [Row("reference and poles", "pass", "within the limits of speed, voltage and sampling")]
     verdict: Verdict = "warn" if is_emulated_bus(setup.config) else "fail"
     return [Row("reference and poles", verdict, *line.rsplit("; ", 1)) for line in setup.warnings]
+
+
+def speed_filter_rows(setup: Setup) -> list[Row]:
+    """What the filter of the drive's speed does to the loop; an emulated drive's own is known."""
+    config = setup.config
+    if config.emulator is None or config.drive.takes == "voltage" or not is_emulated_bus(config):
+        return filter_rows(setup)
+    try:
+        plant, _ = load_plant(setup.path, config)
+    except ConfigError as error:
+        return [Row("speed filter", "warn", str(error), "correct emulator.plant")]
+    return filter_rows(setup, plant.firmware.filtered_by, plant.sensors.w_noise_rad_s)
 
 
 def passed(rows: list[Row]) -> bool:

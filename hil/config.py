@@ -251,6 +251,62 @@ class Command:
     keys: tuple[str, str]
 
 
+class FirstOrderFilter(Table):
+    """The drive's speed through a first-order lag."""
+
+    kind: Literal["first-order"]
+    pole_rad_s: Positive
+    """Pole p of y' = p (w - y)."""
+    modelled: bool = True
+    """The observer takes the filter into its model; false: it does not, and the loop must bear it."""
+
+
+class PllFilter(Table):
+    """The drive's speed by a PLL of two real poles p, q: y'' + (p + q) y' + p q y = p q w."""
+
+    kind: Literal["pll"]
+    pole_1_rad_s: Positive
+    """First pole; of gains k_p, k_i it is (k_p - (k_p^2 - 4 k_i)^1/2) / 2."""
+    pole_2_rad_s: Positive
+    """Second pole, (k_p + (k_p^2 - 4 k_i)^1/2) / 2; a critically damped PLL has both alike."""
+    modelled: bool = True
+    """The observer takes the filter into its model; false: it does not, and the loop must bear it."""
+
+
+class MovingAverageFilter(Table):
+    """The drive's speed as the mean over a window: the angle turned in it over its length."""
+
+    kind: Literal["moving-average"]
+    window_ms: Positive
+    """Length of the window; a whole number of periods, up to 32."""
+    modelled: bool = True
+    """The observer takes the filter into its model; false: it does not, and the loop must bear it."""
+
+
+class NoFilter(Table):
+    """The drive reports the speed as it is."""
+
+    kind: Literal["none"]
+
+
+def _a_table(value: Any) -> Any:
+    """A filter is a table; a name alone says too little."""
+    if isinstance(value, (Table, dict)):
+        return value
+    raise ValueError('must be a table, as { kind = "first-order", pole_rad_s = 1000.0 }')
+
+
+SpeedFilterTable = Annotated[
+    FirstOrderFilter | PllFilter | MovingAverageFilter | NoFilter,
+    Field(discriminator="kind"),
+    BeforeValidator(_a_table),
+]
+
+
+FILTERS: Final = ("first-order", "pll", "moving-average", "none")
+"""Kinds of :data:`SpeedFilterTable`."""
+
+
 class DriveTable(Table):
     """The drive: its DBC and node, and of one with a current loop of its own what that makes of a command."""
 
@@ -276,6 +332,8 @@ class DriveTable(Table):
     """What a current in per mille is of (CiA 402: 6075h)."""
     current_limit_a: Positive | None = None
     """Limit of i_q that is set in the drive: what it cuts off would read as load."""
+    speed_filter: SpeedFilterTable = NoFilter(kind="none")
+    """What the drive does to the speed before it reports it (docs/theory.md, the drive's speed filter)."""
 
     @property
     def takes(self) -> Takes:
@@ -759,6 +817,12 @@ def _of_the_drive(data: Mapping[str, Any]) -> list[str]:
             for key in keys
             if other != takes and limits.get(key) is not None
         ]
+    given = drive.get("speed_filter") if isinstance(drive, Mapping) else None
+    if takes == "voltage" and isinstance(given, Mapping) and given.get("kind") != "none":
+        problems.append(
+            "drive.speed_filter: the drive takes voltages, and no law for those has the filter in its model; "
+            "remove it, or switch the filter off in the drive"
+        )
     if isinstance(observer, Mapping) and takes == "voltage" and observer.get("current") is None:
         problems.append("observer.current: missing; add it")
     return problems
@@ -864,6 +928,7 @@ def _given(value: Any) -> str:
 def _written(loc: tuple[Any, ...]) -> list[str]:
     """The key path as the file has it: pydantic names the kind of a law or an observer after its table."""
     kinds: dict[Any, Any] = {"controller": laws(), "speed": observers(), "current": observers()}
+    kinds["speed_filter"] = FILTERS
     before = ("", *loc)[: len(loc)]
     return [str(part) for table, part in zip(before, loc, strict=True) if part not in kinds.get(table, ())]
 

@@ -17,8 +17,8 @@ import numpy as np
 from firmware_model.config import PlantMotor
 from hil.app import Overrides, RunResult, Setup, bus_settings, load_setup, run
 from hil.config import RunConfig
-from hil.control.law import MotorModel, law_window, sampled_model
-from hil.control.observer import bounds
+from hil.control.law import MotorModel, exact_after, law_window, sampled_model
+from hil.control.observer import Window, bounds, impulse_response, response_length
 from hil.design import law_spec, motor_model
 from hil.emulate import load_plant
 from hil.errors import HilError
@@ -71,15 +71,24 @@ def resolution_bound(setup: Setup) -> float:
     spec = law_spec(setup.config)
     T_s = 1.0 / setup.config.loop.rate_hz
     model = sampled_model(motor_model(setup.config.motor), T_s)
+    if order := int(setup.machine.law["order"][0]):
+        return filtered_bound(setup, law_window(spec, T_s), order)
     limits = bounds(law_window(spec, T_s), model.Ad, model.Ed, T_s, np.array(setup.wire.x_lsb))
     return float(limits.resolution[0])
+
+
+def filtered_bound(setup: Setup, window: Window, order: int) -> float:
+    """:func:`resolution_bound` of a speed through a filter: |window * weights of samples| lsb / 2."""
+    weights = impulse_response(window, response_length(window))[:, 0]
+    every = np.convolve(weights, setup.machine.law["v_y"][0, : order + 2])
+    return float(np.abs(every).sum() * setup.wire.x_lsb[0] / 2)
 
 
 def summary(
     setup: Setup, ticks: TickArray, result: RunResult, verdict: Verdict, true: MotorModel
 ) -> dict[str, Any]:
     """The demo's result, as ``--json`` prints it."""
-    N = int(setup.machine.law["N"][0, 0])
+    N = exact_after(setup.machine.law)[0]
     step: LoadStep | None = load_step(ticks, N, motor_model(setup.config.motor), true)
     return {
         "log": result.log,

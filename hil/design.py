@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.config import LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.control.errors import ControlDesignError
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
-from hil.control.registry import InnerLoop
+from hil.control.registry import InnerLoop, SpeedFilter
 from hil.guard import MEASURED, MOST_MESSAGES, NO_I_D, NO_I_Q, SAFETY_PARAMS
 from hil.kernel import PLACED, new_safety_state, step, whole, whole_at
 from hil.log.named import to_named
@@ -153,6 +154,23 @@ def _values(table: Any) -> dict[str, Any]:
     return keys
 
 
+def speed_filter(given: Any, rate_hz: int) -> SpeedFilter | None:
+    """What a table ``speed_filter`` of a drive means; None for nothing. Raises ControlDesignError."""
+    if given.kind == "first-order":
+        return SpeedFilter((given.pole_rad_s,))
+    if given.kind == "pll":
+        return SpeedFilter((given.pole_1_rad_s, given.pole_2_rad_s))
+    if given.kind == "none":
+        return None
+    periods = given.window_ms * 1e-3 * rate_hz
+    if round(periods) < 1 or abs(periods - round(periods)) > 1e-6 * periods:
+        raise ControlDesignError(
+            f"drive.speed_filter.window_ms = {given.window_ms:g}: no whole number of periods at {rate_hz} "
+            "Hz; change loop.rate_hz, or the drive's window"
+        )
+    return SpeedFilter(ticks=round(periods))
+
+
 def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
     """What the drive makes of a command; None for voltages. ``told``: it reports i_q.
 
@@ -162,7 +180,9 @@ def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
     if drive.takes == "voltage":
         return None
     u_i = config.drive_k_t if drive.takes == "torque" else 1.0
-    return InnerLoop(config.k_t / u_i, u_i, drive.current_lag_ms * 1e-3, drive.delay_ticks, told)
+    given = speed_filter(drive.speed_filter, config.loop.rate_hz)
+    known = given if getattr(drive.speed_filter, "modelled", False) else None
+    return InnerLoop(config.k_t / u_i, u_i, drive.current_lag_ms * 1e-3, drive.delay_ticks, told, known)
 
 
 def law_spec(config: RunConfig, told: bool = True) -> LawSpec:

@@ -22,7 +22,7 @@ from firmware_model.drive import advance, on_command, on_load_command, on_sync
 from firmware_model.node import wire_of
 from hil.app import Setup, header_of, log_path, needed_bytes, plan_of
 from hil.control.jit import jit
-from hil.control.law import FAC
+from hil.control.law import FAC, exact_after
 from hil.design import Machine
 from hil.emulate import load_plant
 from hil.errors import ConfigError
@@ -237,7 +237,7 @@ class Figures:
 
     def __init__(self, setup: Setup) -> None:
         self._totals, self._responses = Totals(), Responses()
-        self._responses.N = int(setup.machine.law["N"][0, 0])
+        self._responses.N = exact_after(setup.machine.law)[0]
         self.seconds = 0.0
 
     def feed(self, ticks: TickArray) -> None:

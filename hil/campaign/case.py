@@ -26,6 +26,7 @@ from hil.campaign.margins import design_margins
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
 from hil.config import RunConfig, override, put, read_toml, validate
 from hil.control.errors import ControlDesignError
+from hil.control.law import exact_after
 from hil.errors import ConfigError, HilError
 from hil.reasons import explain
 from hil.report.criteria import demanded
@@ -156,7 +157,7 @@ class Stand:
 
 def judged(setup: Setup, simulation: Simulation) -> dict[str, Any]:
     """Simulate; the figures, and why it ended where nobody asked."""
-    found = Judged(setup.config, int(setup.machine.law["N"][0, 0]))
+    found = Judged(setup.config, exact_after(setup.machine.law)[0])
     stop = None
     for ticks in simulation.blocks():
         found.feed(ticks)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -27,6 +27,7 @@ from hil.control.linalg import Array, copy, matvec, matvec_add
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
 from hil.control.speed import COMMANDS, ask_speed
+from hil.control.speedfilter import PAST, ROOM, behind, filter_params, hear, innovation, order_of
 
 N_MAX: Final = 1024
 """Longest window D [ticks] that the record has room for."""
@@ -98,19 +99,30 @@ LAW_PARAMS: Final = np.dtype(
         ("share", "f8"),
         ("kappa", "f8"),
         ("g_u", "f8"),
+        ("order", "i8"),
+        ("v_y", "f8", ROOM),
+        ("v_u", "f8", ROOM),
+        ("v_s", "f8", ROOM),
+        ("w_y", "f8", ROOM),
+        ("w_u", "f8", ROOM),
+        ("w_s", "f8", ROOM),
+        ("w_d", "f8"),
+        ("gap_y", "f8", MAX_GAP),
     ],
     align=True,
 )
 """Parameters, from ``shaped`` on neutral at zero: observers of other forms than the pair of exponentials
 (:class:`hil.control.observer.Window`), 1 in ``shaped`` when a channel has one, 1 in ``filtered`` when the law
 takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`);
-from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`)."""
+from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`); from
+``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
 _BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
 _INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
-LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS, *_INNER), 0.0)
+_FILTER = ("order", "v_y", "v_u", "v_s", "w_y", "w_u", "w_s", "w_d", "gap_y")
+LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER), 0.0)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -149,12 +161,18 @@ LAW_STATE: Final = np.dtype(
         ("peak", "f8", 3),
         ("inner", "f8"),
         ("commands", "f8", COMMANDS),
+        ("y", "f8", PAST),
+        ("flow", "f8", PAST),
+        ("bend", "f8", PAST),
+        ("place", "i8"),
+        ("heard", "i8"),
     ],
     align=True,
 )
 """State; from ``h_3`` on of :func:`shape_step` (third exponential, filter), the PI law's integrators ``I``
 [A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d;
-of a drive's own current loop what flows, and the commands on their way, newest first."""
+of a drive's own current loop what flows, and the commands on their way, newest first; of a filtered speed
+rings of what was reported and what flowed, with their newest place, and how many samples were heard."""
 
 Record = npt.NDArray[np.void]
 
@@ -277,7 +295,8 @@ def _window(spec: LawSpec, T_s: float) -> Window:
             raise ControlDesignError(f"observer kind {joint} is one for all channels: give it to both")
         whole: Window = own[0].joint(spec.speed.values(), spec.current.values(), model_of(spec, T_s))
         return whole
-    rows = ((own[0], spec.speed), (own[1], spec.current), (own[1], spec.current))
+    speed = _shortened(spec.speed, order_of(spec.inner), T_s)
+    rows = ((own[0], speed), (own[1], spec.current), (own[1], spec.current))
     model = model_of(spec, T_s)
     return side_by_side(*(_channel(o, c, i, model, T_s) for i, (o, c) in enumerate(rows)))
 
@@ -286,6 +305,25 @@ def _channel(observer: Any, given: ChannelSpec, index: int, model: SampledModel,
     """The window of one channel."""
     window: Window = observer.design(given.values(), Channel(index, T_s, model))
     return window
+
+
+def _shortened(given: ChannelSpec, order: int, T_s: float) -> ChannelSpec:
+    """The window that is left of D when each innovation needs ``order`` ticks itself."""
+    values = given.values()
+    if not order or given.kind == "dob" or values.get("delay_ms") is None:  # a dob has no window
+        return given
+    left = values["delay_ms"] - order * T_s * 1e3
+    if left < 0.999999 * T_s * 1e3:
+        raise ControlDesignError(
+            f"observer.speed.delay_ms = {values['delay_ms']:g}: the states of drive.speed_filter take "
+            f"{order * T_s * 1e3:g} ms of it, and nothing is left; take a longer one"
+        )
+    return replace(given, more=values | {"delay_ms": left})
+
+
+def exact_after(law: Record) -> tuple[int, int]:
+    """Ticks after its last change from which a constant d is known: speed and current channel."""
+    return int(law["N"][0, 0] + law["order"][0]), int(law["N"][0, 1])
 
 
 def _check(spec: LawSpec) -> None:
@@ -340,7 +378,9 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "i_max": spec.i_max,
         "T_L_max": spec.T_L_max,
     }
-    for name, value in (values | law.design(spec.values(), Plan(motor, model, T_s, spec.inner))).items():
+    values |= law.design(spec.values(), Plan(motor, model, T_s, spec.inner))
+    gain = spec.inner.k_u / motor.J if spec.inner else 0.0
+    for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
         params[name] = value
     for name in ("form", "third", "g", "M", "W", "S"):
         if (part := getattr(window, name)).size:
@@ -370,6 +410,7 @@ def reset(s: Any) -> None:
     s["started"] = 0
     s["filled"] = 0
     s["gap"] = 0
+    s["heard"] = 0
     for c in range(3):
         s["d_hat"][c] = 0.0
         s["rho"][c] = 0.0
@@ -414,7 +455,7 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     does a count below 1: there is no such period, and no gap inverse that could be read for it.
     """
     if s["started"]:
-        for _ in range(min(periods, p["max_gap"] + 1)):
+        for _ in range(0 if p["order"] else min(periods, p["max_gap"] + 1)):
             open_loop(p, s)
         s["gap"] += periods
         if periods < 1 or s["gap"] > p["max_gap"]:
@@ -423,20 +464,30 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
         return
     s["x"][0], s["x"][1], s["x"][2] = w, i_q, i_d
     if not s["started"]:
+        if p["order"]:
+            s["y"][s["place"]], s["heard"] = w, 1
         start(p, s)
         return
-    innovate(p, s)
-    if s["filled"] == 0:
-        fill(s["v"], s["h"], s["past"])
-        if p["shaped"]:
-            shape_fill(s)
-    for _ in range(s["gap"]):
+    steps = s["gap"]
+    if p["order"]:
+        steps = hear(p, s)
+    else:
+        innovate(p, s)
+    for step in range(steps):
+        if p["order"]:
+            s["v"][0] = innovation(p, s, (s["place"] - steps + 1 + step) % PAST)
+        if s["filled"] == 0 and step == 0:
+            fill(s["v"], s["h"], s["past"])
+            if p["shaped"]:
+                shape_fill(s)
         s["head"] = window_step(
             p["lam"], p["lam_N"], p["theta"], p["N"], s["v"], s["h"], s["past"], s["head"], s["d_hat"]
         )
         if p["shaped"]:
             shape_step(p, s)
-    s["filled"] = min(s["filled"] + s["gap"], max(p["N"][0], p["N"][1], p["N"][2]))
+    if p["order"]:
+        behind(p, s)
+    s["filled"] = min(s["filled"] + steps, max(p["N"][0], p["N"][1], p["N"][2]))
     start(p, s)
 
 

@@ -72,12 +72,23 @@ class Observer:
 
 
 @dataclass(frozen=True, slots=True)
+class SpeedFilter:
+    """What the drive does to the speed before it reports it: ``poles`` [rad/s], or a mean over ``ticks``.
+
+    One pole: y' = p (w - y).  Two, as of a PLL: y'' + (p + q) y' + p q y = p q w.
+    """
+
+    poles: tuple[float, ...] = ()
+    ticks: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class InnerLoop:
     """What a drive with a current loop of its own makes of a command u [A or N m].
 
     ``k_u``: torque per unit of u [N m]; ``u_i``: unit of u per ampere of i_q; ``lag`` [s]: time constant of
     the current loop; ``delay``: ticks by which a command acts later than with the next latch; ``told``: the
-    drive reports i_q.
+    drive reports i_q; ``filter``: what the speed comes through, None: nothing that the observer is to know.
     """
 
     k_u: float
@@ -85,6 +96,7 @@ class InnerLoop:
     lag: float = 0.0
     delay: int = 0
     told: bool = True
+    filter: SpeedFilter | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from hil.control.jit import jit
+from hil.control.speedfilter import enter
 
 MOST_DELAY: Final = 8
 """Ticks by which a command may act later than with the next latch."""
@@ -31,9 +32,12 @@ def flowed(p: Any, s: Any, i: float, sampled: bool, periods: int) -> float:
         s["inner"] = p["lag"] * before + (1.0 - p["lag"]) * u
         if sampled and period == periods - 1:
             s["inner"] = i
-            total += 0.5 * (before + i)
+            mean = 0.5 * (before + i)
         else:
-            total += p["share"] * before + (1.0 - p["share"]) * u
+            mean = p["share"] * before + (1.0 - p["share"]) * u
+        total += mean
+        if p["order"]:
+            enter(s, mean, s["inner"] - before)
         for age in range(p["delay"], 0, -1):
             s["commands"][age] = s["commands"][age - 1]
     if periods < 1 and sampled:

@@ -11,6 +11,7 @@ from hil.control.law import N_MAX, ROWS, SPEED
 from hil.control.observer import FILTER, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
+from hil.control.speedfilter import MOST_AVERAGE, PAST
 from hil.guard import MOST_MESSAGES, MOST_PERIODS
 from hil.log.named import Record
 from hil.signals import DriveState
@@ -26,6 +27,7 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "form": (0, FILTER),
         "rows": (0, ROWS),
         "delay": (0, MOST_DELAY),
+        "order": (0, MOST_AVERAGE),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {
@@ -40,6 +42,8 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "started": (0, 1),
         "filled": (0, N_MAX),
         "row": (0, ROWS),
+        "place": (0, PAST - 1),
+        "heard": (0, PAST),
     },
 }
 
@@ -52,3 +56,5 @@ def check_ranges(kind: str, record: Record) -> None:
             raise ValueError(f"{kind}.{name} is {value[0]}, not within {low} to {high}")
     if kind == "law" and np.any((record["form"] == FIR) & (record["N"] > FIR_MAX)):
         raise ValueError(f"law.N is {record['N'][0]}, where weights have room for {FIR_MAX}")
+    if kind == "law" and np.any(record["order"]) and not (record["v_y"][0, 0] and record["gap_y"][0].all()):
+        raise ValueError("law.v_y or law.gap_y is 0, by which a kernel divides")

@@ -10,6 +10,7 @@ import numpy as np
 
 from hil.app import frame_time, message_names
 from hil.config import RunConfig, validate
+from hil.control.law import exact_after
 from hil.design import Machine
 from hil.errors import ConfigError, HilError
 from hil.log.reader import Log, Source, new_log, read_blocks
@@ -89,9 +90,8 @@ class Run:
             self.config_problem = str(error)
         else:
             self._safety = machine.safety
-            windows = machine.law["N"][0]
             self.frame_time = frame_time(self.config)
-            self.N = (int(windows[0]), int(windows[1]))
+            self.N = exact_after(machine.law)
             self.responses.N = self.N[0]
 
     def _transitions(self, ticks: TickArray) -> list[tuple[int, float]]:

@@ -10,7 +10,7 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -125,8 +125,12 @@ def _loop(w: Array, u: Array, T_s: float) -> Loop:
         return UNSTABLE
     outside = np.nonzero(error > RECOVERED_RAD_S)[0]
     recovery = (int(outside[-1]) + 1) * T_s * 1e3 if len(outside) else 0.0
-    ms = float(np.abs(np.fft.rfft(u, max(POINTS, len(u)))).max())
-    return Loop(float(error.max()), recovery, float(error.sum() * T_s), ms)
+    return Loop(float(error.max()), recovery, float(error.sum() * T_s), peak_of(u))
+
+
+def peak_of(pulse: Array) -> float:
+    """Ms, the largest |S|, from the response of what acts to a unit pulse added to it."""
+    return float(np.abs(np.fft.rfft(pulse, max(POINTS, len(pulse)))).max())
 
 
 def noise(law: Record, bench: Bench, plant: Plant) -> tuple[float, float]:
@@ -140,22 +144,35 @@ def noise(law: Record, bench: Bench, plant: Plant) -> tuple[float, float]:
     return math.hypot(float(u), decoupling), float(w)
 
 
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Gain margin, phase margin [deg], delay margin [ms]."""
+
+    gain: float
+    phase_deg: float
+    delay_ms: float
+
+
 def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
     """Gain margin, phase margin [deg], delay margin [ms] at the plant's voltage."""
-    pulse = responses(law, [plant], _STEP[1:], bench.ticks)[0, 0, 1]
+    return asdict(margins_of(responses(law, [plant], _STEP[1:], bench.ticks)[0, 0, 1], bench.T_s))
+
+
+def margins_of(pulse: Array, T_s: float) -> Margins:
+    """Margins from the response of what acts to a unit pulse added to it: S, and L = 1 / S - 1."""
     with np.errstate(divide="ignore", invalid="ignore"):
         L = 1 / np.fft.rfft(pulse, 1 << 16) - 1
-    w = np.linspace(0, np.pi / bench.T_s, len(L))[1:-1]
+    w = np.linspace(0, np.pi / T_s, len(L))[1:-1]
     L = L[1:-1]
     cross = np.nonzero((np.abs(L[:-1]) - 1) * (np.abs(L[1:]) - 1) <= 0)[0]
     real = np.nonzero((L[:-1].imag * L[1:].imag <= 0) & (L[:-1].real < 0) & (np.abs(L[:-1]) < 1))[0]
     gains, phases = 1 / np.abs(L[real]), np.angle(-L[cross])
     delays = phases % (2 * np.pi) / w[cross] * 1e3
-    return {
-        "gain": float(gains.min(initial=math.inf)),
-        "phase_deg": float(np.degrees(np.abs(phases)).min(initial=math.inf)),
-        "delay_ms": float(delays.min(initial=math.inf)),
-    }
+    return Margins(
+        float(gains.min(initial=math.inf)),
+        float(np.degrees(np.abs(phases)).min(initial=math.inf)),
+        float(delays.min(initial=math.inf)),
+    )
 
 
 def quiet(law: Record, bench: Bench, plants: Sequence[Plant], seconds: float = 1.2) -> list[bool]:

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 
 from hil.app import Overrides, Setup, load_setup
-from hil.check import reach_rows
+from hil.check import reach_rows, speed_filter_rows
 from hil.control.law import (
     LAW_PARAMS,
     ChannelSpec,
@@ -24,11 +24,13 @@ from hil.control.law import (
 from hil.control.registry import InnerLoop
 from hil.control.speed import flowed, latched
 from hil.errors import HilError
+from hil.filtered import filter_rows
 from hil.metrics import operating
 from hil.replay import replay
 from hil.report.curves import plots_of
 from hil.signals import GuardFlag, Reason, TickArray
 from hil.simulate import simulate, simulate_ticks
+from hil.whatif import what_if
 from tests.conftest import CONFIGS
 
 PATH = CONFIGS / "current.toml"
@@ -138,6 +140,112 @@ def test_a_load_step_is_known_after_d(settings: tuple[str, ...], plant: tuple[st
     assert run["reason"][-1] == Reason.STOP_REQUESTED
     assert settled(run) == ticks
     assert abs(run["w"][3100] - 80.0) < 0.5
+
+
+PLL = '{kind="pll",pole_1_rad_s=1000.0,pole_2_rad_s=1000.0}'
+VESC = '{kind="pll",pole_1_rad_s=15.0,pole_2_rad_s=1985.0}'
+MEAN = '{kind="moving-average",window_ms=4.0}'
+LAG = '{kind="first-order",pole_rad_s=300.0}'
+
+
+def through(real: str, told: str = "", *more: str) -> tuple[Setup, list[str]]:
+    """The setup that tells ``told``, and the plant whose speed comes through ``real``."""
+    tells = (f"drive.speed_filter={told}",) if told else ()
+    return setup_of(*tells, *more), [*MATCHED, f'firmware={{takes="current",speed_filter={real}}}']
+
+
+@pytest.mark.parametrize(
+    ("real", "told", "more", "ticks"),
+    [
+        (PLL, PLL, (), 13),  # 1.1 D
+        (PLL, PLL, (UNTOLD,), 13),
+        (LAG, LAG, (), 13),
+        (MEAN, MEAN, (), 13),
+        (PLL, "", (), 40),  # what it costs not to tell it
+    ],
+)
+@pytest.mark.compiled
+def test_a_load_step_is_known_after_d_through_a_filter_that_is_told(
+    real: str, told: str, more: tuple[str, ...], ticks: int
+) -> None:
+    setup, plant = through(real, told, *more)
+    run = simulate_ticks(setup, plant)
+    assert run["reason"][-1] == Reason.STOP_REQUESTED
+    assert settled(run) <= ticks and (told or settled(run) > 30)
+    assert abs(run["w"][3100] - 80.0) < 0.5
+
+
+@pytest.mark.compiled
+def test_through_a_slow_pll_the_loop_diverges_unless_it_is_told(tmp_path: Path) -> None:
+    more = ("limits.following_error_rad_s=1e6", "limits.w_max_rad_s=200.0")
+    after = slice(2000, 3100)
+    untold = simulate_ticks(*through(VESC, "", *more))
+    assert np.abs(untold["w_ref"][after] - untold["w"][after]).max() > 20.0
+    setup, plant = through(VESC, VESC, f'log.folder="{tmp_path}"')
+    told = simulate_ticks(setup, plant)
+    assert told["reason"][-1] == Reason.STOP_REQUESTED
+    assert np.abs(80.0 - told["w"][after]).max() < 2.0 and abs(told["T_L_hat"][2900:3100].mean() - 5.4) < 0.1
+    log = Path(simulate(setup, plant)["log"])
+    assert replay(log).verdict == "same"
+    again = what_if(log, PATH, setup.config)  # the same controller beside itself
+    assert again.spreads["T_L_hat"].count > 3000 and again.spreads["T_L_hat"].rms < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ((f"drive.speed_filter={VESC[:-1]},modelled=false}}",), "which the observer does not know; let it"),
+        (
+            ('drive.speed_filter={kind="first-order",pole_rad_s=0.01}',),
+            "A of noise of the frames' resolution",
+        ),
+        (('drive.speed_filter={kind="moving-average",window_ms=3.5}',), "no whole number of periods at 1000"),
+        (('drive.speed_filter={kind="moving-average",window_ms=12.0}',), "take 12 ms of it, and nothing is"),
+        (('drive.speed_filter={kind="pll",pole_1_rad_s=9.0}',), "drive.speed_filter.pole_2_rad_s: missing"),
+        (('drive.speed_filter={kind="notch"}',), "drive.speed_filter: input tag 'notch'"),
+        (('drive.speed_filter="pll"',), "drive.speed_filter: must be a table"),
+    ],
+)
+def test_a_filter_that_can_not_be_had_is_one_line(settings: tuple[str, ...], said: str) -> None:
+    with pytest.raises((HilError, ValueError)) as caught:
+        setup_of(*settings)
+    assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_drive_that_takes_voltages_is_told_no_filter() -> None:
+    with pytest.raises(HilError, match=r"drive\.speed_filter: the drive takes voltages"):
+        load_setup(CONFIGS / "demo.toml", Overrides(settings=(f"drive.speed_filter={PLL}",)))
+
+
+def test_check_says_what_the_filter_does_to_the_loop(tmp_path: Path) -> None:
+    plain, told = setup_of(), setup_of(f"drive.speed_filter={PLL}")
+    unknown = setup_of(f"drive.speed_filter={PLL[:-1]},modelled=false}}")
+    slow = setup_of(f"drive.speed_filter={VESC}")
+    pll, vesc, none = (s.config.drive.speed_filter for s in (told, slow, plain))
+
+    def row(setup: Setup, *real: Any) -> Any:
+        (found,) = filter_rows(setup, *real)
+        return found
+
+    assert row(plain).verdict == row(told).verdict == row(unknown).verdict == "pass"
+    assert row(plain).found.startswith("no filter: Ms 1.46")
+    assert "poles of 1000 and 1000 rad/s, which the observer knows: Ms 1.60" in row(told).found
+    assert "which the observer does not know: Ms 2.03" in row(unknown).found
+    assert row(plain, vesc).verdict == "fail" and "not stable" in row(plain, vesc).found
+    assert row(plain, pll).verdict == row(told, none).verdict == "warn"
+    assert (
+        row(slow, None, 0.01).verdict == "warn"
+        and "longer observer.speed.delay_ms" in row(slow, None, 0.01).remedy
+    )
+    near = setup_of('drive.speed_filter={kind="pll",pole_1_rad_s=300.0,pole_2_rad_s=300.0,modelled=false}')
+    assert row(near).verdict == "warn" and "lower speed_pole_rad_s" in row(near).remedy
+    assert filter_rows(load_setup(CONFIGS / "demo.toml", Overrides())) == []
+    (emulated,) = speed_filter_rows(setup_of())
+    assert emulated.verdict == "pass" and "0.01 rad/s of noise make 0.015 N m" in emulated.found
+    (odrive,) = speed_filter_rows(load_setup(CONFIGS / "odrive.toml", Overrides()))
+    assert odrive.verdict == "pass" and "which the observer knows" in odrive.found
+    (broken,) = speed_filter_rows(setup_of('emulator.plant="none.toml"'))
+    assert broken.verdict == "warn" and "none.toml" in broken.found
 
 
 def torque_setup(folder: Path, *settings: str) -> Setup:

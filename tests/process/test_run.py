@@ -93,19 +93,29 @@ def test_the_demo_says_what_happened(configs: Path, settings: Settings) -> None:
     assert Path(result["log"]).is_file()
 
 
-@pytest.mark.parametrize("name", ["demo.toml", "current.toml"])
+PLL = '{kind="pll",pole_1_rad_s=1000.0,pole_2_rad_s=1000.0}'
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "plant"),
+    [
+        ("demo.toml", (), ()),
+        ("current.toml", (), ()),
+        ("current.toml", (f"drive.speed_filter={PLL}",), ("firmware.speed_pll_rad_s=1000.0",)),
+    ],
+)
 def test_lockstep_twice_and_simulated_are_the_same_to_the_bit(
-    configs: Path, settings: Settings, name: str
+    configs: Path, settings: Settings, name: str, more: tuple[str, ...], plant: tuple[str, ...]
 ) -> None:
-    path, own = configs / name, settings('loop.clock="lockstep"', "loop.duration_s=3.0")
+    path, own = configs / name, settings('loop.clock="lockstep"', "loop.duration_s=3.0", *more)
     overrides, logged = Overrides(settings=own), []
     setup = load_setup(path, overrides)
     for cores in ({0}, {0, 1}):
-        with emulator_process(path, overrides):
+        with emulator_process(path, overrides, plant):
             os.sched_setaffinity(0, cores & set(range(os.cpu_count() or 1)))
             logged.append(open_log(Path(run(setup).log)).ticks)
     os.sched_setaffinity(0, set(range(os.cpu_count() or 1)))
-    simulated = simulate_ticks(setup)
+    simulated = simulate_ticks(setup, list(plant))
     seal(simulated)  # what the log's writer adds
     assert len(simulated) > 3000
     for field in FIELDS:

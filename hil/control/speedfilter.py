@@ -1,0 +1,270 @@
+"""A speed y that is reported through a filter of known poles: w and d from y, in exact sampled form.
+
+With z = (w, state of the filter), n numbers in all, the constant current u of a tick
+(:mod:`hil.control.speed`) and the change b of the current in it,
+    z+ = F z + G u + S b + E d,   y = C z
+what of any n + 1 samples no start of z can explain is the innovation, and of n samples there is one z:
+    v_k = sum_j r_j y_{k-j} - (known inputs),   v_k = sum_j e_j d_{k-1-j} with sum_j e_j = 1
+    w_k = sum_j p_j y_{k-j} + (known inputs) + t d_hat_k
+Both are exact for a d that is constant over their samples; nothing is filtered a second time. v_k needs
+n - 1 ticks more than without a filter, by which the observer's window is shorter: the whole is exact after D
+as before. To undo a filter costs noise, |r| and |p|: each pole multiplies it by (1 + l^2)^1/2 / (1 - l) and
+more, l = e^{-pole T_s}; a mean does not.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from hil.control.errors import ControlDesignError
+from hil.control.fac import MAX_GAP
+from hil.control.jit import jit
+from hil.control.linalg import Array, condition, dot, exp, halvings_of, integral_exponential, inverse
+from hil.control.registry import InnerLoop, SpeedFilter
+
+MOST_AVERAGE: Final = 32
+"""Ticks of the longest moving average."""
+ROOM: Final = MOST_AVERAGE + 2
+"""Samples that v rests on, at most: n + 1."""
+PAST: Final = 128
+"""Ring of past samples: those of a gap, and those that the first of it needs."""
+MOST_CONDITION: Final = 1e12
+"""Of the samples that z is found from."""
+
+
+def order_of(inner: InnerLoop | None) -> int:
+    """States of the filter that the observer takes into its model."""
+    if inner is None or inner.filter is None:
+        return 0
+    return inner.filter.ticks or len(inner.filter.poles)
+
+
+def sampled_filter(given: SpeedFilter, friction: float, gain: float, lag: float | None, T_s: float) -> Any:
+    """F (n, n), G, S, E (n,), C (n,) of z = (w, filter), w' = friction w + gain i + d; friction [1/s].
+
+    The current of a tick runs straight from its first sample to its last (``lag`` None), else as a
+    first-order lag; by u and b the effect on w is that of u alone.
+    """
+    A = _continuous(given, friction)
+    n = len(A)
+    whole = np.zeros((n + 3, n + 3))  # (z, i, its target or slope, d)
+    whole[:n, :n], whole[0, n], whole[0, n + 2] = A, gain, 1.0
+    if lag is None:
+        whole[n, n + 1] = 1.0 / T_s
+    elif lag:
+        whole[n, n], whole[n, n + 1] = -1.0 / lag, 1.0 / lag
+    step, _ = integral_exponential(whole, T_s, halvings_of(whole, T_s))
+    held, E = _held(A, gain, T_s), step[:n, n + 2]
+    if lag is None:  # u = i + b / 2
+        S = step[:n, n + 1] - 0.5 * step[:n, n]
+    elif lag:  # i + (target - i)(1 - l) = i + b
+        S = step[:n, n + 1] / (1.0 - step[n, n])
+        S = S - held * (S[0] / held[0])
+    else:
+        S = np.zeros(n)
+    S[0] = 0.0
+    C = np.zeros(n)
+    C[min(1, n - 1)] = 1.0
+    parts = step[:n, :n], held, S, E, C
+    return _averaged(parts, given.ticks, T_s) if given.ticks else parts
+
+
+def _continuous(given: SpeedFilter, friction: float) -> Array:
+    """A of (w, filter): f' = p (w - f);  f'' = p q (w - f) - (p + q) f';  a mean: the angle turned."""
+    if given.ticks:
+        return np.array([[friction, 0.0], [1.0, 0.0]])
+    if len(given.poles) == 1:
+        (p,) = given.poles
+        return np.array([[friction, 0.0], [p, -p]])
+    p, q = given.poles
+    return np.array([[friction, 0.0, 0.0], [0.0, 0.0, 1.0], [p * q, -p * q, -(p + q)]])
+
+
+def _held(A: Array, gain: float, T_s: float) -> Array:
+    """Effect of a constant current of 1 on z."""
+    _, integral = integral_exponential(A, T_s, halvings_of(A, T_s))
+    return integral[:, 0] * gain
+
+
+def _averaged(parts: Any, ticks: int, T_s: float) -> Any:
+    """z = (w, angle of the last tick, of the one before, ...), y their sum over the window's length."""
+    step, *inputs, _ = parts
+    n = 1 + ticks
+    F, C = np.zeros((n, n)), np.full(n, 1.0 / (ticks * T_s))
+    F[0, 0], F[1, 0], C[0] = step[0, 0], step[1, 0], 0.0
+    for row in range(2, n):
+        F[row, row - 1] = 1.0
+    return F, *(np.r_[one, np.zeros(n - 2)] for one in inputs), C
+
+
+def _rows(F: Array, C: Array, count: int) -> Array:
+    """C, C F, C F^2, ...; (count, n)."""
+    rows = [C]
+    for _ in range(count - 1):
+        rows.append(np.array([dot(rows[-1], column) for column in F.T]))
+    return np.array(rows)
+
+
+def _innovation(given: SpeedFilter, F: Array, T_s: float) -> Array:
+    """Weights r_j of y_{k-j} that no z explains: F's characteristic polynomial, of a mean (q - a) q^M."""
+    weights = np.array([1.0, -F[0, 0]])
+    for pole in given.poles:
+        weights = np.convolve(weights, np.array([1.0, -exp(-pole * T_s)]))
+    return weights
+
+
+def _reconstruction(given: SpeedFilter, F: Array, C: Array) -> Array:
+    """Weights p_j of y_{k-j}, j < n, that give w_k for every z. Raises ControlDesignError."""
+    n = len(F)
+    seen, first = _rows(F, C, n), np.eye(n)[0]
+    speed = _rows(F, first, n)[-1]
+    if given.ticks:  # what was before the window is forgotten: one sample tells
+        return np.array([speed[0] / seen[-1][0]])
+    if not condition(seen) < MOST_CONDITION:
+        raise ControlDesignError("drive.speed_filter: no number of samples tells the speed behind it")
+    back = inverse(seen)
+    return np.array([dot(speed, column) for column in back.T])[::-1]
+
+
+def _known(r: Array, rows: Array, before: Array, inputs: tuple[Array, ...]) -> list[Array]:
+    """Weights of an input X of j ticks ago, beside r of the samples: wanted_j X - sum_i r_i C F^{j-i} X.
+
+    ``rows``: C F^j; ``before``: what is wanted of z, times F^j; j counts from the newest, 0.
+    """
+    out = []
+    for X in inputs:
+        effect = [dot(row, X) for row in rows]
+        own = [dot(row, X) for row in before]
+        out.append(
+            np.array(
+                [
+                    own[j] - math.fsum(r[i] * effect[j - i] for i in range(min(j + 1, len(r))))
+                    for j in range(len(before))
+                ]
+            )
+        )
+    return out
+
+
+def filter_params(inner: InnerLoop | None, friction: float, gain: float, T_s: float) -> dict[str, Any]:
+    """The filter's part of LAW_PARAMS; empty without a filter. Raises ControlDesignError."""
+    if inner is None or inner.filter is None:
+        return {}
+    given = inner.filter
+    _check(given, T_s)
+    lag = None if inner.told else inner.lag
+    F, G, S, E, C = sampled_filter(given, friction, gain, lag, T_s)
+    n = len(F)
+    rows, none = _rows(F, C, MAX_GAP), np.zeros((n, n))
+    r, p = _innovation(given, F, T_s), _reconstruction(given, F, C)
+    v_u, v_s, v_d = _known(r, rows, none, (G, S, E))
+    w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n)[: n - 1], (G, S, E))
+    scale = -math.fsum(v_d)
+    if not 0.0 < scale < math.inf:
+        raise ControlDesignError(
+            "drive.speed_filter: too slow for loop.rate_hz: no sample shows a disturbance"
+        )
+    steps = np.array([dot(row, E) for row in rows])
+    return {
+        "order": n - 1,
+        "v_y": _padded(r / scale),
+        "v_u": _padded(v_u / scale),
+        "v_s": _padded(v_s / scale),
+        "w_y": _padded(p),
+        "w_u": _padded(w_u),
+        "w_s": _padded(w_s),
+        "w_d": math.fsum(w_d),
+        "gap_y": np.array([math.fsum(steps[: m + 1]) for m in range(MAX_GAP)]),
+    }
+
+
+def _padded(values: Array) -> Array:
+    out = np.zeros(ROOM)
+    out[: len(values)] = values
+    return out
+
+
+def _check(given: SpeedFilter, T_s: float) -> None:
+    """Refuse a filter that the record has no room for, or that the sampling does not see."""
+    if given.ticks > MOST_AVERAGE:
+        raise ControlDesignError(
+            f"drive.speed_filter.window_ms: {given.ticks} periods, and {MOST_AVERAGE} are kept at most; "
+            "lower loop.rate_hz"
+        )
+    slow = [pole for pole in given.poles if pole * T_s < 1e-6]
+    if slow:
+        raise ControlDesignError(
+            f"drive.speed_filter: a pole of {slow[0]:g} rad/s says nothing of the speed in a period; "
+            "set a faster one in the drive"
+        )
+
+
+@jit
+def enter(s: Any, u: float, bend: float) -> None:
+    """Begin the next place of the ring: a period with the constant current u, in which it changed by bend."""
+    s["place"] = (s["place"] + 1) % PAST
+    s["flow"][s["place"]], s["bend"][s["place"]] = u, bend
+
+
+@jit
+def inputs_of(s: Any, place: int, count: int, by_u: Any, by_bend: Any) -> float:
+    """Sum over the ``count`` periods that end at ``place``, of what flowed in them."""
+    total = 0.0
+    for j in range(count):
+        at = (place - j) % PAST
+        total += by_u[j] * s["flow"][at] + by_bend[j] * s["bend"][at]
+    return total
+
+
+@jit
+def innovation(p: Any, s: Any, place: int) -> float:
+    """v at the end of the period at ``place``."""
+    total = inputs_of(s, place, p["order"] + 1, p["v_u"], p["v_s"])
+    for j in range(p["order"] + 2):
+        total += p["v_y"][j] * s["y"][(place - j) % PAST]
+    return total
+
+
+@jit
+def bridge(p: Any, s: Any, gap: int, y: float) -> None:
+    """The samples that a gap of ``gap`` periods lacks: those of a d that changed when it began, and led to y.
+
+    With d_hat as it was each would be what makes v = d_hat.
+    """
+    for j in range(gap - 1, -1, -1):
+        at = (s["place"] - j) % PAST
+        s["y"][at] = 0.0
+        s["y"][at] = (s["d_hat"][0] - innovation(p, s, at)) / p["v_y"][0]
+    off = (y - s["y"][s["place"]]) / p["gap_y"][gap - 1]
+    for j in range(gap - 1, 0, -1):
+        s["y"][(s["place"] - j) % PAST] += off * p["gap_y"][gap - 1 - j]
+
+
+@jit
+def hear(p: Any, s: Any) -> int:
+    """Take the reported speed s['x'][0] after s['gap'] periods; return for how many of them there is a v.
+
+    None until there are samples enough, after a start; the observer waits.
+    """
+    y, gap, n = s["x"][0], s["gap"], p["order"] + 1
+    if gap > 1 and s["heard"] <= n:
+        s["heard"] = 0
+    elif gap > 1:
+        bridge(p, s, gap, y)
+    s["y"][s["place"]] = y
+    s["heard"] = min(s["heard"] + gap if s["heard"] else 1, PAST)
+    return int(gap) if s["heard"] > n else 0
+
+
+@jit
+def behind(p: Any, s: Any) -> None:
+    """Write the speed behind the filter to s['x'][0]; what is reported as long as samples are too few."""
+    n = p["order"] + 1
+    if s["heard"] >= n:
+        w = inputs_of(s, s["place"], n - 1, p["w_u"], p["w_s"]) + p["w_d"] * s["d_hat"][0]
+        for j in range(n):
+            w += p["w_y"][j] * s["y"][(s["place"] - j) % PAST]
+        s["x"][0] = w

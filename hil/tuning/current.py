@@ -1,0 +1,142 @@
+"""The linear loop of a drive with a current loop of its own, through what filters its speed.
+
+The very kernels of the tick against the exact sampled plant x = (w, i, filter), without limits and rounding;
+i in the unit of the command. S is that of the reported speed: from a step that nobody filtered to what the
+observer gets; Ms and margins follow as in :mod:`hil.tuning.measure`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from scipy.linalg import expm
+
+from hil.control.jit import jit
+from hil.control.law import MotorModel, ask, new_law_state, observe, reset
+from hil.control.linalg import Array
+from hil.control.registry import InnerLoop, SpeedFilter
+from hil.control.speed import COMMANDS, flowed, latched
+from hil.control.speedfilter import MOST_AVERAGE
+from hil.tuning.loop import LOAD, NO_LIMIT, PULSE_W, Record
+from hil.tuning.measure import Margins, margins_of, peak_of
+
+RESPONSE_S: Final = 1.0
+"""Length of the responses; a loop that has not come to rest by then counts as unstable."""
+QUIET: Final = 2 * MOST_AVERAGE
+"""Ticks at rest before the disturbance: the observer has its samples and its memory by then."""
+RESTLESS: Final = 0.02
+"""Share of a response's peak that may be left in its last tenth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shaft:
+    """x+ = A x + b u + e d, y = C x with x = (w, i, ...); A (n, n), b, e and C (n,)."""
+
+    A: Array
+    b: Array
+    e: Array
+    C: Array
+
+
+def shaft_of(motor: MotorModel, inner: InnerLoop, given: SpeedFilter | None, T_s: float) -> Shaft:
+    """Exact for u and d held over a tick; ``given`` filters the speed, whatever the observer knows of it."""
+    given = given or SpeedFilter()
+    f = 2 if given.ticks else len(given.poles)
+    whole = np.zeros((f + 4, f + 4))  # (w, i, filter), u, d
+    whole[0, 0], whole[0, 1], whole[0, -1] = -motor.B_f / motor.J, inner.k_u / motor.J, 1.0
+    lag = inner.lag or 1e-4 * T_s
+    whole[1, 1], whole[1, -2] = -1.0 / lag, 1.0 / lag
+    C = np.eye(f + 2)[2 if f else 0]
+    if given.ticks:
+        whole[2, 0], f = 1.0, 1
+    elif f == 1:
+        whole[2, 0], whole[2, 2] = given.poles[0], -given.poles[0]
+    elif f == 2:
+        p, q = given.poles
+        whole[2, 3], whole[3, 0], whole[3, 2], whole[3, 3] = 1.0, p * q, -p * q, -p - q
+    step, n = expm(whole * T_s), f + 2
+    shaft = Shaft(step[:n, :n], step[:n, -2], step[:n, -1], C[:n])
+    return _mean(shaft, given.ticks, T_s) if given.ticks else shaft
+
+
+def _mean(shaft: Shaft, ticks: int, T_s: float) -> Shaft:
+    """(w, i, angle of the last tick, of the one before, ...)."""
+    n = 2 + ticks
+    A, C = np.zeros((n, n)), np.zeros(n)
+    A[:3, :2], C[2:] = shaft.A[:, :2], 1.0 / (ticks * T_s)
+    for row in range(3, n):
+        A[row, row - 1] = 1.0
+    b, e = (np.r_[part, np.zeros(ticks - 1)] for part in (shaft.b, shaft.e))
+    return Shaft(A, b, e, C)
+
+
+@jit
+def respond_current(p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind: int, out: Array) -> None:
+    """The loop's response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on."""
+    n, K = A.shape[0], out.shape[1]
+    x, new, way = np.zeros(n), np.zeros(n), np.zeros(COMMANDS)
+    reset(s)
+    latched(p, s, 0.0, False)
+    for k in range(-QUIET, K):
+        y = 1.0 if kind == PULSE_W and k == 0 else 0.0
+        for c in range(n):
+            y += C[c] * x[c]
+        s["ua"][0] = flowed(p, s, x[1], p["told"] != 0, 1)
+        observe(p, s, y, 0.0, 0.0, True, 1)
+        latched(p, s, way[0], True)
+        ask(p, s, 0.0, 0.0, 0.0, NO_LIMIT)
+        acts = way[p["delay"]]
+        load = 1.0 if kind == LOAD and k >= 0 else 0.0
+        if k >= 0:
+            out[0, k], out[1, k], out[2, k], out[3, k] = s["u"][1], y, x[0], s["d_hat"][0]
+        for age in range(p["delay"], 0, -1):
+            way[age] = way[age - 1]
+        way[0] = s["u"][1]
+        for r in range(n):
+            total = b[r] * acts + e[r] * load
+            for c in range(n):
+                total += A[r, c] * x[c]
+            new[r] = total
+        for r in range(n):
+            x[r] = new[r]
+
+
+NONE: Final = Margins(0.0, 0.0, 0.0)
+"""Margins of a loop that is not stable."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Whether the loop is stable, its margins, and d_hat [rad/s2] and u for noise of 1 rad/s rms in y."""
+
+    stable: bool
+    ms: float = math.inf
+    margins: Margins = NONE
+    d_noise: float = math.inf
+    u_noise: float = math.inf
+
+
+def loop_of(law: Record, shaft: Shaft, T_s: float) -> Loop:
+    """Run a law through a shaft's filter and judge it."""
+    own, state = law.copy(), new_law_state()
+    own["i_max"] = np.inf
+    step, pulse = np.empty((2, 4, min(max(round(RESPONSE_S / T_s), 500), 20_000)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for kind, out in ((LOAD, step), (PULSE_W, pulse)):
+            respond_current(own[0], state[0], shaft.A, shaft.b, shaft.e, shaft.C, kind, out)
+    if not all(_at_rest(row) for row in (step[2], pulse[0], pulse[1])):
+        return Loop(False)
+    u, seen, _, d = pulse
+    d_noise, u_noise = (math.sqrt(float((row**2).sum())) for row in (d, u))
+    return Loop(True, peak_of(seen), margins_of(seen, T_s), d_noise, u_noise)
+
+
+def _at_rest(response: Array) -> bool:
+    """True when the last tenth is near nothing."""
+    if not np.isfinite(response).all():
+        return False
+    size = np.abs(response)
+    return bool(size[-len(size) // 10 :].max() <= RESTLESS * size.max())
