@@ -25,6 +25,7 @@ from drivers.units import DRIVE_TORQUE, FIRST, shown, unit_of
 
 __all__ = ["MOST_COUNTS", "Binding", "Bound", "bind"]
 
+MOST_EXPECTED = 32
 _COUNTER_PLACE = {2: (8, 4), 5: (16, 8)}
 
 
@@ -43,6 +44,7 @@ class _Binder:
         self._mistakes: list[str] = []
         self._factors: dict[str, float] = {}
         self._counters = self._counted()
+        self._expected = self._expectations()
         skipped = () if load else ("load_torque", "load_enable")
         self._received = self._places(RECEIVED, ())
         self._sent = self._places(SENT, skipped)
@@ -67,6 +69,22 @@ class _Binder:
             if message in out:
                 self._add(f"counters: {message} has two, {out[message]} and {signal}; leave one")
             out[message] = signal
+        return out
+
+    def _expectations(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """(signal, the raw number that it must have) of each message that is taken with that alone."""
+        out: dict[str, tuple[str, tuple[int, ...]]] = {}
+        for text, value in self._map.expect.items():
+            for name, signal in self._pairs("expect", (text,)):
+                message = self._message(name, "expect", signal)
+                bits = message.signals[signal].length if message else 0
+                if name in out:
+                    self._add(f"expect: {name} has two, {out[name][0]} and {signal}; leave one")
+                if message and not (bits <= MOST_EXPECTED and 0 <= value < 1 << bits):
+                    self._add(
+                        f"expect: {value} is no raw number of {text}, {bits} bits of at most {MOST_EXPECTED}"
+                    )
+                out[name] = signal, (int(value),)
         return out
 
     def _places(self, parts: dict[str, Part], skipped: tuple[str, ...]) -> dict[str, tuple[str, str]]:
@@ -161,10 +179,16 @@ class _Binder:
     def _frames(
         self, message: Message, signals: dict[str, str]
     ) -> Iterator[tuple[str, tuple[int, ...], tuple[tuple[str, str], ...]]]:
-        """(multiplexer, its values, (part, signal) pairs) of each kind of frame of a received message."""
+        """(multiplexer, its values, (part, signal) pairs) of each kind of frame of a received message.
+
+        What a message must say to be taken is as a multiplexer of one value.
+        """
         behind = {part: message.behind[name] for part, name in signals.items() if name in message.behind}
+        expected = self._expected.get(message.name)
+        if expected and behind:
+            self._add(f"expect: {message.name} has a multiplexer, which tells its frames apart; leave it out")
         if not behind:
-            yield "", (), tuple(signals.items())
+            yield *(expected or ("", ())), tuple(signals.items())
             return
         selectors = {selector for selector, _ in behind.values()}
         if len(selectors) > 1:

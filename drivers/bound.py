@@ -60,6 +60,11 @@ class Binding:
     nmt: Message | None = None
     node_id: int = 1
 
+    @property
+    def opener(self) -> Message | None:
+        """What begins the drive's cycle: SYNC, or the command that it answers, which is the last tick's."""
+        return self.command.message if self.map.poll else self.sync
+
     def signal(self, part: str) -> Signal | None:
         """The signal of a part, in SI units; None when the drive has none."""
         for bound in self.incoming + self.outgoing:

@@ -38,7 +38,7 @@ from drivers.frames import (
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
 from drivers.mapping import RECEIVED, DriveMap, house_map
-from drivers.oneshot import NoAnswer, Shot
+from drivers.oneshot import Expected, NoAnswer, Shot
 from drivers.port import Compiled, Saved, SocketPort
 from drivers.posix import (
     COMMANDED,
@@ -55,6 +55,7 @@ from drivers.posix import (
     command,
     exchange,
     follow,
+    rest,
 )
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
@@ -153,15 +154,25 @@ class DriveClient:
         for out in self._outgoing:
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
             out.encode = partial(entry(encode_command, *args, 0), *args)
-        sync = self.binding.sync
-        self._sync = None if sync is None else Outgoing(sync, 0)
-        if self._sync is not None:
-            self._sync.raw[4] = min(self._sync.message.length, 1)
-            self._note_when_sent(self._sync)
         self._on_change = dict.fromkeys(self.binding.map.on_change, b"")
         """What of those messages was sent last."""
         self._stops = [self._stop_frames(out) for out in self._outgoing]
+        self._polls = self.binding.map.poll != ""
+        self._sync = self._opening()
         self._started, self._left = (self._nmt_frame(command) for command in (START, PRE_OPERATIONAL))
+
+    def _opening(self) -> Outgoing | None:
+        """What begins the drive's cycle: SYNC, or the command it answers, off until one is laid over it."""
+        opener = self.binding.opener
+        if opener is None:
+            return None
+        out = Outgoing(opener, 0)
+        if self._polls:
+            out.lay(np.tile(self._stops[-1][0].raw, 2))
+        else:
+            out.raw[4] = min(opener.length, 1)
+        self._note_when_sent(out)
+        return out
 
     def _stop_frames(self, out: Outgoing) -> list[Outgoing]:
         """The stop frames of one message, ready to be sent, by the command's counter. Raises EncodeError."""
@@ -220,7 +231,10 @@ class DriveClient:
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
             if len(self._outgoing) == 1:
                 own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": sent_offsets(tick.dtype)}
+                own |= {"sync": self._sync.raw} if self._sync is not None and self._polls else {}
                 self._command = self._port.commander(own | self._commanding)
+        if self._sync is not None:
+            rest(self._sync.raw)
         self._tick = tick
 
     def _note_absent(self, tick: Any) -> None:
@@ -289,10 +303,13 @@ class DriveClient:
         if self._sync is None:
             return
         self._cells[_SYNCS] = count = self._cells[_SYNCS] % SYNC_COUNTS + 1
-        if self._sync.raw[4]:
+        if self._sync.raw[4] == 1:
             self._sync.view[8] = count
         self._sync.encode(self._now())
-        self._transmit(self._sync)
+        try:
+            self._transmit(self._sync)
+        finally:
+            rest(self._sync.raw)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Drain the bus until feedback came or the deadline passed; 0 drains what is there (newest wins).
@@ -424,7 +441,9 @@ class DriveClient:
             if out.encode(now_ns) < 0:
                 self._refuse(out)
         for out in self._outgoing:
-            if out.message.name not in self._on_change:
+            if self._polls and self._sync is not None:
+                self._sync.raw[: len(out.raw)] = out.raw
+            elif out.message.name not in self._on_change:
                 self._transmit(out)
             elif (data := bytes(out.view[DATA_AT:])) != self._on_change[out.message.name]:
                 self._transmit(out)
@@ -505,17 +524,19 @@ class DriveClient:
 
     def _await(self, shot: Shot) -> None:
         """Wait until the drive has said all that the frame expects. Raises NoAnswer."""
-        missing, end = list(shot.expected), time.monotonic_ns() + round(shot.within_s * 1e9)
+        missing: dict[Expected, float | None] = dict.fromkeys(shot.expected)
+        end = time.monotonic_ns() + round(shot.within_s * 1e9)
         while missing and (left := end - time.monotonic_ns()) > 0:
             frame = self._link.receive(left)
-            if frame is not None:
-                whole = frame.can_id | frame.flags
-                missing = [one for one in missing if not one.came(whole, frame.data)]
+            if frame is None:
+                continue
+            for one in list(missing):
+                said = one.said(frame.can_id | frame.flags, frame.data)
+                missing[one] = missing[one] if said is None else said
+                if said == one.value:
+                    del missing[one]
         if missing:
-            raise NoAnswer(
-                f"{shot.message.name} was sent, and {', '.join(map(str, missing))} did not come within "
-                f"{shot.within_s * 1e3:g} ms; look at the drive's state and errors (drive.signals.start)"
-            )
+            raise NoAnswer(shot.unanswered(missing))
 
     def leave(self) -> None:
         """Stop frames of the map, node back to pre-operational; never raises. A full queue is tried again."""
@@ -543,9 +564,10 @@ class DriveClient:
         if self._timed is not None:
             self._timed.stop()
         counter = self._cells[_LAST_SENT]
+        opens = [] if self._polls else [self._send_sync]
         for _ in range(STOP_REPEATS):
             counter = (counter + 1) % self.binding.counter_modulus
-            try_all([*(partial(self._stop_with, frames[counter]) for frames in self._stops), self._send_sync])
+            try_all([*(partial(self._stop_with, frames[counter]) for frames in self._stops), *opens])
             self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, 0
         self.leave()
         with contextlib.suppress(Exception):  # the log is not what matters now

@@ -21,6 +21,7 @@ from drivers.local import EFF_FLAG
 from drivers.node import NodeRule
 from drivers.signal import Signal, compile_signal
 
+STANDARD_MOST: Final = 0x7FF
 FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
 CRC_BYTES: Final = {0: 0, 2: 1, 5: 2}
 """Bytes at the begin of a frame that its E2E profile fills in."""
@@ -43,6 +44,7 @@ class Message:
         self.name = block.name
         self.extended = bool(raw_id & EFF_FLAG)
         self.can_id, self.fixed = node.moved(raw_id & ~EFF_FLAG, self.extended)
+        self.extended = self.extended or self.can_id > STANDARD_MOST
         self.length = int(parsed.message.length)
         self.cycle_ms = max(statements.number("GenMsgCycleTime", raw_id) or 0.0, 0.0)
         self.fd = statements.is_fd(raw_id) or self.length > 8
@@ -52,6 +54,8 @@ class Message:
             )
         self.signals, self.odd, self.behind = _signals(parsed, self.length, where, statements, raw_id)
         self.start = _starts(parsed, statements, raw_id)
+        self.unwatched = statements.attribute("Unwatched", raw_id) or ""
+        """Why a drive that is commanded by it does not miss its master; empty where it does."""
         self.profile, self.data_ids = _protection(statements, raw_id, where)
         if self.profile and self.length < 3:
             raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")
@@ -271,7 +275,8 @@ class Database:
         for raw_id, names in self._names.items():
             extended = raw_id & EFF_FLAG
             with contextlib.suppress(DatabaseError):  # one that the rule does not fit is none of this drive's
-                out.setdefault(self.node.moved(raw_id & ~EFF_FLAG, bool(extended))[0] | extended, names[0])
+                moved = self.node.moved(raw_id & ~EFF_FLAG, bool(extended))[0]
+                out.setdefault(moved | (EFF_FLAG if moved > STANDARD_MOST else extended), names[0])
         return out
 
     def of_frame(self, send_id: int) -> Message | None:

@@ -7,17 +7,19 @@ by no drive client, and is never sent in real time. An emulator without faults n
 from __future__ import annotations
 
 from typing import Final
+from zlib import crc32
 
 from drivers.bus import Frame, Link
 from drivers.local import EFF_FLAG
 
 TICK_OVER: Final = 0x1FFFFFFE | EFF_FLAG
+CLASSIC_MOST: Final = 8
 WAIT_NS: Final = 2_000_000_000
 
 
 def tick_over(sync: bytes) -> tuple[int, bytes]:
-    """Identifier and data of the frame that ends the tick of a SYNC with that data."""
-    return TICK_OVER, sync
+    """Identifier and data of the frame that ends the tick of a SYNC with that data, or of a longer frame."""
+    return TICK_OVER, sync if len(sync) <= CLASSIC_MOST else crc32(sync).to_bytes(4, "little")
 
 
 class LockstepLink:
@@ -42,7 +44,7 @@ class LockstepLink:
             if frame is None or frame.can_id | frame.flags != TICK_OVER:
                 return frame
             self._told = True
-            if frame.data == self._sync:
+            if frame.data == tick_over(self._sync)[1]:
                 self._open = False
                 return None
 

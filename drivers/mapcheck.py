@@ -39,6 +39,10 @@ def mistakes_of_map(drive: DriveMap, names: Names) -> Iterator[str]:
     received, sent = ({name for name, _ in places.values()} for places in (names.received, names.sent))
     for name in sorted(received & sent):
         yield f"{name} is both received and sent; a frame has one sender"
+    yield from _polled(drive, {name for name, _ in names.sent.values()})
+    for text in drive.expect:
+        if (name := text.partition(".")[0]) not in received:
+            yield f"expect: {name} is no message that is read"
     for name in names.counters:
         if name not in received and all(name != message for _, (message, _) in names.all_sent):
             yield f"counters: {name} is no message of this map"
@@ -61,6 +65,19 @@ def _one_command(drive: DriveMap) -> Iterator[str]:
         yield "i_d_ref: goes with i_q_ref; leave it out"
     if drive.torque and drive.i_q:
         yield "i_q and torque: one of them tells what flows; leave the other out"
+
+
+def _polled(drive: DriveMap, sent: set[str]) -> Iterator[str]:
+    """A drive that answers its command alone gets that in SYNC's place, and has no other."""
+    if not drive.poll:
+        return
+    lead = next((text for part in COMMANDED_Q if (text := getattr(drive, part))), "").partition(".")[0]
+    if drive.poll != lead:
+        yield f"poll: {drive.poll} is not the message with the command; that is {lead or 'missing'}"
+    if drive.sync or drive.step:
+        yield "poll: the drive's cycle begins with its command; leave sync and step out"
+    if others := ", ".join(sorted(sent - {drive.poll})):
+        yield f"poll: all that is sent must be in {drive.poll}; {others} would go out beside it"
 
 
 def mistakes_of_changes(made: Binding) -> Iterator[str]:
@@ -158,6 +175,9 @@ def mistakes_of_frames(made: Binding, node: NodeRule) -> Iterator[str]:
 def mistakes_of_values(made: Binding) -> Iterator[str]:
     """Of what will be sent: stopping must never fail on a range, and both axes have one step."""
     yield from mistakes_of_changes(made)
+    why = made.outgoing[-1].message.unwatched if made.outgoing else ""
+    if why and not made.map.unwatched:
+        yield f"{made.outgoing[-1].message.name}: {why}; take a mode that is watched, or say unwatched = true"
     for bound in made.outgoing:
         yield from _unsendable(bound)
     names = ("u_q", "u_d") if made.map.u_q else ("i_q_ref", "i_d_ref")

@@ -142,6 +142,8 @@ class DriveMap:
     """Enable of the load machine."""
     sync: str = ""
     """Message that begins the drive's cycle."""
+    poll: str = ""
+    """Message of the command, of a drive that answers it alone: it is sent in SYNC's place."""
     emergency: str = ""
     """Emergency message of the drive."""
     heartbeat: str = ""
@@ -164,6 +166,10 @@ class DriveMap:
     """Frame counters, one for each message that has one."""
     constants: Mapping[str, int | float] = field(default_factory=dict)
     """Signals that are always sent with a value, by MESSAGE.Signal."""
+    expect: Mapping[str, int] = field(default_factory=dict)
+    """Raw number that a signal of a received message must have, by MESSAGE.Signal, or it is not taken."""
+    unwatched: bool = False
+    """Command a mode of the drive in which it never misses its master (attribute Unwatched in the DBC)."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Unit of a part or a MESSAGE.Signal for which the DBC has another, none or an unknown one."""
     pole_pairs: int | None = None
@@ -263,6 +269,10 @@ def _value(key: str, value: Any) -> Any:
         return _states(value) if isinstance(value, Mapping) else None
     if key == "constants":
         return _named(value, int | float)
+    if key == "expect":
+        return _named(value, int)
+    if key == "unwatched":
+        return value if isinstance(value, bool) else None
     if key == "units":
         return _named(value, str)
     return value if isinstance(value, str) else None

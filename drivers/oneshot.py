@@ -5,7 +5,7 @@ Each may wait, and may expect what the drive then sends. Names and values are ch
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -17,7 +17,10 @@ MOST_MS: Final = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class OneShot:
-    """A frame as the map has it: ``values`` by signal, the others 0; ``expect``: MESSAGE.Signal = value."""
+    """A frame as the map has it: ``values`` by signal, the others the DBC's start value or 0.
+
+    ``expect``: MESSAGE.Signal = value.
+    """
 
     message: str
     values: Mapping[str, int | float] = field(default_factory=dict)
@@ -34,14 +37,19 @@ class Expected:
     signal: str
     value: float
 
-    def came(self, whole_id: int, data: bytes) -> bool:
-        """True when this frame says it."""
+    def said(self, whole_id: int, data: bytes) -> float | None:
+        """What this frame says of it; None for another frame."""
         if whole_id != self.message.send_id or len(data) != self.message.length:
-            return False
-        return bool(self.message.decode(data)[self.signal] == self.value)
+            return None
+        return self.message.decode(data)[self.signal]
+
+    @property
+    def name(self) -> str:
+        """MESSAGE.Signal."""
+        return f"{self.message.name}.{self.signal}"
 
     def __str__(self) -> str:
-        return f"{self.message.name}.{self.signal} = {self.value:g}"
+        return f"{self.name} = {self.value:g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +61,20 @@ class Shot:
     wait_s: float
     expected: tuple[Expected, ...]
     within_s: float
+
+    def unanswered(self, missing: Mapping[Expected, float | None]) -> str:
+        """Why the drive is not started: what did not come, and what it said instead."""
+        wanted = ", ".join(map(str, missing))
+        said = [f"{one.name} = {value:g}" for one, value in missing.items() if value is not None]
+        instead = f"it said {', '.join(said)}" if said else f"no {self._silent(missing)} came at all"
+        return (
+            f"{self.message.name} was sent, and {wanted} did not come within {self.within_s * 1e3:g} ms: "
+            f"{instead}; look at the drive's state, errors and node number (drive.signals.start)"
+        )
+
+    @staticmethod
+    def _silent(missing: Iterable[Expected]) -> str:
+        return ", ".join(dict.fromkeys(one.message.name for one in missing))
 
 
 def shots_from(value: Any) -> tuple[OneShot, ...] | None:
@@ -82,11 +104,18 @@ def bound_shots(
 def _bound(what: str, one: OneShot, database: Database, add: Callable[[str], None]) -> Iterator[Shot]:
     try:
         message = database.message(one.message, *one.values)
-        data = message.encode(dict.fromkeys(message.signals, 0) | dict(one.values))
+        data = message.encode(_started(message) | dict(one.values))
         expected = tuple(_expected(text, value, database) for text, value in _flat(one.expect))
         yield Shot(message, data, one.wait_ms * 1e-3, expected, one.within_ms * 1e-3)
     except (DatabaseError, EncodeError) as error:
         add(f"{what}: {str(error).removeprefix(f'{database.path}: ')}")
+
+
+def _started(message: Message) -> dict[str, int | float]:
+    """What is sent where nobody gives a value."""
+    known = {name: message.signals[name] for name in message.start.keys() & message.signals.keys()}
+    starts = {name: message.start[name] * one.scale + one.offset for name, one in known.items()}
+    return dict.fromkeys(message.signals, 0) | starts
 
 
 def _flat(expect: Mapping[str, Any]) -> Iterator[tuple[str, float]]:

@@ -22,6 +22,7 @@ from drivers.jit import array_at, jit, waiting
 from drivers.states import FAULT_RESET, state_of
 from drivers.wire import (
     DATA_AT,
+    FD_BYTES,
     FRAME,
     MESSAGE,
     REFUSED,
@@ -227,9 +228,18 @@ def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
     return DONE
 
 
+@jit
+def rest(raw: Any) -> None:
+    """Let a command that went out in SYNC's place say off, as the frame behind it does, until the next."""
+    for at in range(FD_BYTES, len(raw)):
+        raw[at - FD_BYTES] = raw[at]
+
+
 @waiting
 def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     """Take what waits as late, send SYNC with its counter and :func:`drain`; PENDING where SYNC must wait.
+
+    A command that the drive answers stands in SYNC's place, the frame that says off behind it.
 
     It waits for flags to be told, a bus that was down, and what can't be judged of the late frames, which is
     in ``IO`` at LATE then. Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
@@ -246,10 +256,11 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
         return PENDING
     s["got"] = 0
     s["syncs"] = s["syncs"] % SYNC_COUNTS + 1
-    if raw[4] > 0:
+    if raw[4] == 1:
         raw[DATA_AT] = s["syncs"]
     note(log, s, raw, 0, now_ns(times))
     code = transmit(fds, raw, size, state, log)
+    rest(raw)
     return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
 
 
@@ -297,7 +308,10 @@ def gather(values: Any, tick: Any, fields: Any) -> None:
 
 @jit
 def command(places: Any) -> Any:
-    """Lay out and send a tick's command of one message. Returns DONE, REFUSED_COMMAND or -errno."""
+    """Lay out and send a tick's command of one message. Returns DONE, REFUSED_COMMAND or -errno.
+
+    One that the drive answers is laid in SYNC's place, from where :func:`exchange` sends it.
+    """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, RAW, U1)
     values, fields = array_at(places, VALUES, F8), array_at(places, FIELDS, I8)
     messages, signals = array_at(places, MESSAGES, MESSAGE), array_at(places, SIGNALS, SIGNAL)
@@ -307,7 +321,11 @@ def command(places: Any) -> Any:
     size = encode_command(raw, values, 0, messages, signals, state, words, log, now_ns(times))
     if size == REFUSED:
         return REFUSED_COMMAND
-    code = transmit(fds, raw, size, state, log)
+    sync, code = array_at(places, SYNC, U1), DONE
+    for at in range(min(FD_BYTES, len(sync))):
+        sync[at] = raw[at]
+    if len(sync) == 0:
+        code = transmit(fds, raw, size, state, log)
     if code == DONE:
         state[0]["last_sent"], state[0]["controlword"] = int(values[0]), int(values[1])
     return code

@@ -33,7 +33,8 @@ def refeed(
 
     ``limits``: when each tick was computed, on the frames' clock: what came later is another's. ``ids``: SYNC
     that the controller sends (-1: none), its command, the drive's emergency (-1: none). ``counters`` (n + 1):
-    of the command before the first tick, then of each tick's; ``tick``: its bytes before the first.
+    of the command before the first tick, then of each tick's; ``tick``: its bytes before the first. A command
+    that the drive answers is its own SYNC.
     ``listens`` (n): ticks that sent no SYNC, since the guardian had stopped the drive.
     """
     at = 0
@@ -46,6 +47,8 @@ def refeed(
                 if can_id == ids[0]:
                     late, done = False, False
                     state[0]["got"] = 0
+                    if can_id == ids[1]:  # the last tick's command, which the drive answers
+                        state[0]["last_sent"] = counters[j]
                 elif can_id == ids[1]:  # a clock of lockstep stands still from feedback to command
                     state[0]["last_sent"] = counters[j + (frame["t_ns"] == limits[j])]
             elif can_id == ids[2]:

@@ -6,6 +6,9 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
 from drivers.codec import Message
 from drivers.errors import QueueFull
 from drivers.local import CLASSIC, FD
@@ -23,6 +26,10 @@ class Outgoing:
         self.raw = laid_out(message.send_id, message.length, message.fd)
         self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
         self.encode: Send = lambda t_ns: -1
+
+    def lay(self, raw: npt.NDArray[np.uint8]) -> None:
+        """Take a buffer that is laid out, its frame first."""
+        self.raw, self.view = raw, raw.data[: len(self.view)]
 
 
 def try_all(sends: Iterable[Callable[[], None]]) -> None:

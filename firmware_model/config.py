@@ -257,9 +257,10 @@ class PlantConfig(Table):
     """Path of the DBC that the drive speaks, relative to this file."""
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """Number of the drive on the bus."""
-    protocol: Literal["house", "inverter", "cia402", "odrive"] = "house"
+    protocol: Literal["house", "inverter", "cia402", "odrive", "moteus"] = "house"
     """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo;
-    cia402: CANopen, mute until hil configure has mapped its PDOs; odrive: CAN Simple."""
+    cia402: CANopen, mute until hil configure has mapped its PDOs; odrive: CAN Simple; moteus: its
+    register protocol over CAN FD."""
     eds: str = ""
     """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"

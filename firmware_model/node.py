@@ -29,6 +29,7 @@ from firmware_model.faulty_plant import PlantFaults, advance_open_phase
 from firmware_model.house import HouseFrames, Sent
 from firmware_model.inverter import InverterFrames
 from firmware_model.kernels import Kernels
+from firmware_model.moteus import MoteusFrames
 from firmware_model.odrive import ODriveFrames
 from firmware_model.plant import State
 from firmware_model.station import (
@@ -43,7 +44,7 @@ from firmware_model.station import (
     station,
 )
 
-Frames = HouseFrames | InverterFrames | Cia402Frames | ODriveFrames
+Frames = HouseFrames | InverterFrames | Cia402Frames | ODriveFrames | MoteusFrames
 
 Eds = tuple[Path, dict[int, dict[int, bytes]]]
 """A CANopen node's EDS, and what it has stored."""
@@ -51,7 +52,7 @@ BLACK_BOX = "black box: "
 LOOK_NS = 1_000_000_000
 """So long a busy drive serves the bus without asking whether to stop; a signal asks at once."""
 RUN_OUT_NS = 500_000_000
-Protocol = Literal["house", "inverter", "cia402", "odrive"]
+Protocol = Literal["house", "inverter", "cia402", "odrive", "moteus"]
 
 
 def frames_of(
@@ -63,6 +64,8 @@ def frames_of(
         return Cia402Frames(path, database.node.node_id, stored)
     if protocol == "odrive":
         return ODriveFrames(database.node.node_id, truth=truth)
+    if protocol == "moteus":
+        return MoteusFrames(database.node.node_id, truth=truth)
     return InverterFrames(truth=truth) if protocol == "inverter" else HouseFrames(database, truth=truth)
 
 
@@ -219,13 +222,15 @@ class Node:
 
     def take(self, frame: Frame) -> None:
         """Handle one frame, whole or not at all."""
-        if frame.can_id | frame.flags != self._frames.sync_id:
+        opens = frame.can_id | frame.flags == self._frames.sync_id
+        asked = isinstance(self._frames, MoteusFrames)
+        if asked or not opens:
             self._frames.take(frame, self._kernels, self._on_command)
             if due := self._frames.due:
                 self._frames.due = ()
                 self._send(due)
-        elif self._pacing == "sync":
-            if len(frame.data) > 1:  # CANopen: no data or the counter
+        if opens and self._pacing == "sync":
+            if len(frame.data) > 1 and not asked:  # CANopen: no data or the counter
                 self.ignored["length"] += 1
             else:
                 self.sync(time.monotonic_ns())

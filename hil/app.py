@@ -191,7 +191,8 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     database = read(path.parent / config.drive.dbc, config.drive.node_id, config.drive.node_rule)
     load = config.controller.kind == "fac"
     parts = drive_map(config, database, str(path))
-    period_ms = None if parts.sync else config.loop.period_ns * 1e-6  # with SYNC it answers as often as asked
+    asked = parts.sync or parts.poll  # then it answers as often as that
+    period_ms = None if asked else config.loop.period_ns * 1e-6
     if parts.sync and parts.sync == parts.step:  # lockstep: it paces the loop
         loop = config.loop.model_copy(update={"pacing": "sync"})
         config = config.model_copy(update={"loop": loop})
@@ -222,9 +223,13 @@ def _check_command(path: Path, config: RunConfig) -> None:
 
 def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
     """A drive that takes no SYNC can't be paced by it. Raises ConfigError."""
-    if binding.sync is None and config.loop.clock == "lockstep":
+    if binding.map.poll and config.loop.pacing != "sync":
+        raise ConfigError(
+            str(path), ['loop.pacing: the drive answers each command (drive.signals.poll); take "sync"']
+        )
+    if binding.opener is None and config.loop.clock == "lockstep":
         raise ConfigError(str(path), ['loop.clock: a drive without SYNC keeps its own time; take "realtime"'])
-    if binding.sync is None and config.loop.pacing == "sync":
+    if binding.opener is None and config.loop.pacing == "sync":
         raise ConfigError(
             str(path), ['loop.pacing: the drive takes no SYNC (drive.signals has no sync); take "feedback"']
         )
@@ -415,7 +420,7 @@ def _client(
     load = setup.config.controller.kind == "fac"
     link: Link = open_link(bus_settings(setup.config))
     if setup.config.loop.clock == "lockstep":
-        sync = setup.binding.sync
+        sync = setup.binding.opener
         link = LockstepLink(link, sync.send_id if sync else None)
     return DriveClient(
         link,
@@ -459,6 +464,8 @@ def check_arming(setup: Setup, arm: bool) -> None:
 
 def check_reachable(setup: Setup) -> None:
     """Say what can't be had; refuse it on a bus that may be real. Raises ArmingError."""
+    if why := setup.binding.command.message.unwatched:
+        say(f"warning: drive.signals.unwatched: {why}")
     for line in setup.warnings:
         say(f"warning: {line}")
     if setup.warnings and not (setup.config.loop.shadow or is_emulated_bus(setup.config)):
@@ -586,8 +593,9 @@ def _recorded(
     watch = CommandWatch(setup.binding) if config.loop.shadow else None
     with opened_client(setup, recorder, clock, watch) as client:
         recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
-        say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
-        _await_drive(setup, client)
+        if watch or not setup.binding.map.poll:
+            say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
+            _await_drive(setup, client)
         if not watch:
             _hear_others(setup, client)
         recorder.await_open()

@@ -33,7 +33,7 @@ OPERATIONAL = 5
 HEAT = ("temperature_motor", "temperature_inverter")
 FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
-SILENT = "a drive that only answers SYNC can't show it before arming; nothing to do"
+SILENT = "a drive that only answers SYNC or commands can't show it before arming; nothing to do"
 
 
 def check(setup: Setup) -> list[Row]:
@@ -199,6 +199,7 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
         frames_row(traffic),
         *length_rows(traffic, setup.binding),
         *started_rows(setup.binding),
+        *unwatched_rows(setup.binding),
         others_row(traffic, setup.binding),
         state_row(traffic, setup.binding, values),
         *version_rows(setup, traffic, silent_ok),
@@ -225,6 +226,8 @@ def drive_row(traffic: Traffic, binding: Binding, seconds: float) -> Row:
     if traffic.down:
         return Row("drive", "fail", "the bus went down while listening", remedy)
     found = f"heard {', '.join(names) or 'nothing'} in {seconds:g} s, {traffic.foreign} frames not in the DBC"
+    if binding.map.poll and not names:
+        return Row("drive", "warn", found, SILENT)
     return row("drive", bool(names), found, remedy)
 
 
@@ -271,6 +274,12 @@ def started_rows(binding: Binding) -> list[Row]:
     return [Row("start values", "pass", f"{', '.join(said)} (GenSigStartValue)")] if said else []
 
 
+def unwatched_rows(binding: Binding) -> list[Row]:
+    """A command that goes on acting when its master has died."""
+    why = binding.command.message.unwatched
+    return [Row("watchdog", "warn", why, "take a mode of the drive that it watches")] if why else []
+
+
 def others_row(traffic: Traffic, binding: Binding) -> Row:
     """Does somebody else command the drive."""
     messages = [binding.sync, *(bound.message for bound in binding.outgoing)]
@@ -292,6 +301,8 @@ def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> R
     if code := _emergency(traffic, binding):
         return Row("drive state", "fail", f"error {words(code)} by its emergency message", remedy)
     beat = _nmt_state(traffic, binding)
+    if beat is None and binding.map.poll:
+        return Row("drive state", "warn", "unknown: it answers when it is asked, after arming", SILENT)
     if beat is None:
         return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
     nmt = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"

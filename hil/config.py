@@ -315,7 +315,7 @@ class DriveTable(Table):
     node_id: Annotated[int, Field(ge=0, le=255)] = 1
     """Number of the drive on the bus; it moves the identifiers of the DBC as node_rule says."""
     node_rule: str = ""
-    """Where the node's number goes in identifiers, as "id << 5"; empty: CANopen's."""
+    """Where the node's number goes in identifiers, as "id << 5", or "moteus"; empty: CANopen's."""
     heartbeat_timeout_s: Annotated[float, Field(ge=1e-3, le=3600, allow_inf_nan=False)] = 3.0
     """How long to listen for the drive before arming, and in hil check."""
     signals: dict[str, Any] | None = None

@@ -166,7 +166,7 @@ def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
     """Run the demo, in lockstep where the host can't hold its rate; raises HilError with one clear line."""
     path = path or find_config("demo.toml")
     setup, result, log = closed_loop(path, overrides)
-    slow = too_slow(setup, result, log) if setup.binding.sync else ""
+    slow = too_slow(setup, result, log) if setup.binding.opener else ""
     if slow:
         say(f"{slow}; going on in lockstep: the same loop and drive, without real time")
         setup, result, log = closed_loop(path, in_lockstep(overrides, setup))

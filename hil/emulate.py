@@ -32,7 +32,7 @@ def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None)
 def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple[Node, Link, str]:
     """Load everything, open the bus; return the node and a line that says what it is."""
     plant, folder = load_plant(path, config, plant_settings)
-    database = Database(folder / plant.dbc, plant.node_id)
+    database = Database(folder / plant.dbc, plant.node_id, config.drive.node_rule)
     params = build_params(plant, wire_of(database, plant.protocol))
     link: Link = open_link(bus_settings(config))
     lockstep = config.loop.clock == "lockstep"

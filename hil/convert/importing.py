@@ -123,6 +123,11 @@ def import_recording(
     if out.suffix.lower() != ".mcap":
         raise LogError(f"{out}: a log ends in .mcap")
     setup = load_setup(config, Overrides(settings=settings))
+    if setup.binding.map.poll:
+        raise LogError(
+            f"{config}: drive.signals.poll: a recording with a drive that is asked by its command can't be "
+            "imported; the run's own log replays"
+        )
     recording = Recording(source, channel, partial)
     period_ns = setup.config.loop.period_ns
     if recording.step_ns > period_ns:

@@ -75,7 +75,7 @@ class FrameCheck:
         assert fields is not None  # noqa: S101 - a record has fields
         state["needed"] = needed
         state["echo_at"] = -1 if binding.map.echo else fields["echo"][1]
-        sync = binding.sync if config.loop.pacing == "sync" and not config.loop.shadow else None
+        sync = binding.opener if config.loop.pacing == "sync" and not config.loop.shadow else None
         sent = (sync, binding.command.message, binding.emergency)
         ids = np.array([-1 if message is None else message.send_id for message in sent], np.int64)
         self._kernel: Any = (

@@ -1,6 +1,7 @@
 """Sent frames against the ticks: a tick's command, laid out again with the logged map, must give the frame.
 
-A command belongs to the tick that was computed last before it. After the last tick stop frames follow it.
+A command belongs to the tick that was computed last before it; one that the drive answers goes out at the
+begin of the next, and says off where there is none. After the last tick stop frames follow.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class SentCheck:
     """Compares a run's commands tick by tick; the next block's first frames follow the tick ``last``."""
 
     def __init__(self, binding: Binding) -> None:
-        self._binding = binding
+        self._binding, self._polls = binding, binding.map.poll != ""
         self.last: TickArray = np.empty(0, TICK)
         messages, signals = outgoing_tables(binding)
         self._ids, self._raw = messages["id"], np.zeros(128, np.uint8)
@@ -52,9 +53,11 @@ class SentCheck:
             return None
         frames = frames[(frames["received"] == 0) & np.isin(frames["can_id"], self._ids)]
         computed = ticks["t_ns"].astype(np.int64) + ticks["computed_ns"]
-        owners = np.searchsorted(computed, frames["t_ns"].astype(np.int64), "right") - 1
+        sent = frames["t_ns"].astype(np.int64)
+        owners = np.searchsorted(computed, sent, "left" if self._polls else "right") - 1
+        off = (last & (sent >= computed[-1])) | (self._polls & (ticks["send"][owners] == 0))
         for at in np.nonzero(self._wrong(frames, owners, ticks))[0]:
-            if not (last and owners[at] == len(ticks) - 1 and self._is_stop(frames[at : at + 1])):
+            if not (off[at] and self._is_stop(frames[at : at + 1])):
                 return self._difference(ticks[owners[at] : owners[at] + 1], frames[at : at + 1])
         self.last = ticks[-1:].copy()
         return None
