@@ -5,6 +5,7 @@ Sends nothing, but for questions by SDO to a drive that has a ``[canopen]`` tabl
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from rich.table import Table
@@ -18,6 +19,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.app import LOAD_REMEDY, Setup, bus_settings, is_emulated_bus, load_found, log_path, needed_bytes
 from hil.config import BusTable, LimitsTable
+from hil.control.law import CASCADE, PI
 from hil.emulate import load_plant
 from hil.errorcodes import words
 from hil.errors import ConfigError, HilError, plain
@@ -33,6 +35,8 @@ OPERATIONAL = 5
 HEAT = ("temperature_motor", "temperature_inverter")
 FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
+MOST_MS = 3.0
+"""Peak of the sensitivity in the worst corner without a warning: a phase margin of 19 deg at least."""
 SILENT = "a drive that only answers SYNC or commands can't show it before arming; nothing to do"
 
 
@@ -44,6 +48,7 @@ def check(setup: Setup) -> list[Row]:
         *reach_rows(setup),
         *speed_filter_rows(setup),
         load_row(setup),
+        *adaptive_rows(setup),
         *heard_rows(setup),
         *canopen_rows(setup),
         *realtime_rows(config.realtime),
@@ -157,6 +162,54 @@ def load_row(setup: Setup) -> Row:
     """Worst-case bus load of this run; other nodes' frames come on top."""
     found, good = load_found(setup)
     return row("bus load", good, found, LOAD_REMEDY)
+
+
+def adaptive_rows(setup: Setup) -> list[Row]:
+    """Rows about an adaptive window: is its noise that of the frames at least, is it stable."""
+    from hil.tuning.measure import adapts
+
+    law = setup.machine.law
+    if not adapts(law):
+        return []
+    rows = [noise_row(setup)]
+    if int(law["kind"][0]) in (CASCADE, PI):
+        rows.append(modes_row(setup))
+    return rows
+
+
+def noise_row(setup: Setup) -> Row:
+    """Thresholds below the resolution take every step of it for a load."""
+    observer = setup.config.observer
+    tables = [observer.speed, observer.speed if observer.current is None else observer.current]
+    w_lsb, q_lsb, d_lsb = setup.wire.x_lsb
+    least = w_lsb / math.sqrt(12.0), max(q_lsb, d_lsb) / math.sqrt(12.0)
+    told = [
+        (getattr(table, key), low)
+        for table in tables
+        if table.kind == "adaptive"
+        for key, low in zip(("w_noise_rad_s", "i_noise_a"), least, strict=True)
+    ]
+    found = f"resolution alone: w_noise_rad_s = {least[0]:.3g}, i_noise_a = {least[1]:.3g}"
+    remedy = "observer: give the noise that is measured at constant speed, the resolution included"
+    return row("adaptive noise", all(value >= 0.99 * low for value, low in told), found, remedy, "warn")
+
+
+def modes_row(setup: Setup) -> Row:
+    """The loop of the short window and that of the long one, with the motor believed in and +-30 %."""
+    from hil.tuning.bench import bench_of
+    from hil.tuning.measure import loops
+
+    bench = bench_of(setup.path, setup)
+    nominal, *corners = loops(setup.machine.law, bench, bench.plants())
+    worst = max(loop.ms for loop in corners)
+    found = (
+        f"Ms {nominal.ms:.2f}, {worst:.2f} with J, psi_f, R_s, L off by 30 %, at most {MOST_MS:g} wanted; "
+        "inf is unstable"
+    )
+    remedy = "lengthen short_ms, shorten delay_ms or slow the poles: hil design --law adaptive"
+    if not nominal.stable:
+        return Row("adaptive window", "fail", found, remedy)
+    return row("adaptive window", worst <= MOST_MS, found, remedy, "warn")
 
 
 def heard_rows(setup: Setup) -> list[Row]:

@@ -103,14 +103,17 @@ def _poles(config: RunConfig) -> Iterator[str]:
 
 def _delays(config: RunConfig) -> Iterator[str]:
     """A window is a whole number of periods."""
-    for where, table in _tables(config):
-        delay = table.get("delay_ms")
-        if delay is None or table.get("kind") == "dob":
-            continue
-        periods = delay * 1e-3 * config.loop.rate_hz
+    lengths = [
+        (f"{where}.{key}", table[key])
+        for where, table in _tables(config)
+        for key in ("delay_ms", "short_ms", "first_ms")
+        if table.get(key) is not None and table.get("kind") != "dob"
+    ]
+    for key, length in lengths:
+        periods = length * 1e-3 * config.loop.rate_hz
         whole = max(1, round(periods))
         if abs(periods - whole) > 1e-6 * whole:
             yield (
-                f"{where}.delay_ms = {delay:g}: no whole number of periods at {config.loop.rate_hz} Hz; "
+                f"{key} = {length:g}: no whole number of periods at {config.loop.rate_hz} Hz; "
                 f"{whole * 1e3 / config.loop.rate_hz:g} ms is taken"
             )

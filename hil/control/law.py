@@ -19,6 +19,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from hil.control.adaptive import remember
 from hil.control.composite import predict
 from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
@@ -108,6 +109,8 @@ LAW_PARAMS: Final = np.dtype(
         ("w_s", "f8", ROOM),
         ("w_d", "f8"),
         ("gap_y", "f8", MAX_GAP),
+        ("short", "i8", 3),
+        ("first", "i8", 3),
     ],
     align=True,
 )
@@ -115,9 +118,10 @@ LAW_PARAMS: Final = np.dtype(
 (:class:`hil.control.observer.Window`), 1 in ``shaped`` when a channel has one, 1 in ``filtered`` when the law
 takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`);
 from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`); from
-``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`)."""
+``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`); lengths of an
+adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``."""
 
-_SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i")
+_SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
 _BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
 _INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
@@ -166,13 +170,19 @@ LAW_STATE: Final = np.dtype(
         ("bend", "f8", PAST),
         ("place", "i8"),
         ("heard", "i8"),
+        ("length", "i8", 3),
+        ("hold", "i8", 3),
+        ("still", "i8", 3),
+        ("doubt", "i8", 3),
+        ("x_last", "f8", 3),
     ],
     align=True,
 )
 """State; from ``h_3`` on of :func:`shape_step` (third exponential, filter), the PI law's integrators ``I``
 [A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d;
 of a drive's own current loop what flows, and the commands on their way, newest first; of a filtered speed
-rings of what was reported and what flowed, with their newest place, and how many samples were heard."""
+rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
+adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still."""
 
 Record = npt.NDArray[np.void]
 
@@ -312,6 +322,11 @@ def _shortened(given: ChannelSpec, order: int, T_s: float) -> ChannelSpec:
     values = given.values()
     if not order or given.kind == "dob" or values.get("delay_ms") is None:  # a dob has no window
         return given
+    if given.kind == "adaptive":
+        raise ControlDesignError(
+            "observer.speed.kind adaptive: its thresholds are those of a speed without drive.speed_filter; "
+            "take another kind, or leave the filter out"
+        )
     left = values["delay_ms"] - order * T_s * 1e3
     if left < 0.999999 * T_s * 1e3:
         raise ControlDesignError(
@@ -382,7 +397,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
     gain = spec.inner.k_u / motor.J if spec.inner else 0.0
     for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
         params[name] = value
-    for name in ("form", "third", "g", "M", "W", "S"):
+    for name in ("form", "third", "g", "M", "W", "S", "short", "first"):
         if (part := getattr(window, name)).size:
             params[name] = part
     params["shaped"], params["filtered"] = params["form"].any(), params["S"].any()
@@ -479,12 +494,14 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
         if s["filled"] == 0 and step == 0:
             fill(s["v"], s["h"], s["past"])
             if p["shaped"]:
-                shape_fill(s)
+                shape_fill(p, s)
         s["head"] = window_step(
             p["lam"], p["lam_N"], p["theta"], p["N"], s["v"], s["h"], s["past"], s["head"], s["d_hat"]
         )
         if p["shaped"]:
             shape_step(p, s)
+    if p["shaped"]:
+        remember(p, s, s["gap"])
     if p["order"]:
         behind(p, s)
     s["filled"] = min(s["filled"] + steps, max(p["N"][0], p["N"][1], p["N"][2]))
@@ -510,9 +527,12 @@ def filtered_state(p: Any, s: Any) -> None:
 @jit
 def look_ahead(p: Any, s: Any) -> None:
     """x_p: the state one tick on under the input that acts now; d_p = d_hat + c(x_p)."""
-    for c in range(3):
-        s["d_p"][c] = s["d_hat"][c] + s["c"][c]
     filtered_state(p, s)
+    copy(s["c"], s["work"])
+    if p["short"][2] > 0:  # an adaptive window's i_d is quieter than the measured one
+        known_terms(p, s["x_hat"], s["work"])
+    for c in range(3):
+        s["d_p"][c] = s["d_hat"][c] + s["work"][c]
     predict(p["Ad"], p["Bd"], p["Ed"], s["x_hat"], s["ua"], s["d_p"], s["x_p"])
     known_terms(p, s["x_p"], s["work"])
     for c in range(3):

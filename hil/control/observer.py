@@ -3,17 +3,19 @@
 Both share the innovation v_k = Ed^-1 (x_k - Ad x_{k-1} - Bd ua_{k-1}), which equals d_{k-1} exactly, and
 differ in the window that they put over it. The small interface of a window: a design that yields
 :class:`Window`, its step kernels, and :func:`impulse_response` for its bounds. A conventional DOB is the
-window with one pole, Theta = (1, 0) and no delayed term, so both run through one kernel. Three more forms
-take its place in their channels: a third exponential, weights over past innovations, a linear filter.
+window with one pole, Theta = (1, 0) and no delayed term, so both run through one kernel. Four more forms
+take its place in their channels: a third exponential, weights over past innovations, a linear filter, and a
+window of variable length (:mod:`hil.control.adaptive`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
 
+from hil.control.adaptive import adaptive_fill, adaptive_step
 from hil.control.errors import ControlDesignError
 from hil.control.jit import jit
 from hil.control.linalg import Array, Index, exp, power
@@ -28,8 +30,8 @@ MAX_RESPONSE = 1 << 20
 FIR_MAX: Final = 256
 """Longest finite impulse response [ticks] that the record has room for."""
 
-PAIR, THIRD, FIR, FILTER = range(4)
-"""Forms of a channel: two exponentials (also the DOB), three, weights over the past innovations, a filter."""
+PAIR, THIRD, FIR, FILTER, ADAPTIVE = range(5)
+"""Forms of a channel: two exponentials (also the DOB), three, weights, a filter, variable length."""
 
 
 def _none() -> Array:
@@ -45,6 +47,8 @@ class Window:
     Empty where no channel needs them: ``form`` (n,), one of PAIR, THIRD, FIR, FILTER; ``third`` (3, n): lam,
     lam^N and Theta of a third exponential; ``g`` (FIR_MAX, n): d_hat_k = sum_j g_j v_{k-j}; ``M``, ``W``,
     ``S`` (n, n): rho_k = M rho_{k-1} + v_k - d_hat_{k-1}, d_hat_k = d_hat_{k-1} + W rho_k, x_hat = x - S rho.
+    Of an adaptive one ``N`` is the longest, ``short`` and ``first`` (n,) the lengths after a change, and
+    ``g`` the bounds h sigma_n of the estimates by 1 to N ticks.
     """
 
     lam: Array
@@ -57,6 +61,8 @@ class Window:
     M: Array = field(default_factory=_none)
     W: Array = field(default_factory=_none)
     S: Array = field(default_factory=_none)
+    short: Array = field(default_factory=_none)
+    first: Array = field(default_factory=_none)
 
     @property
     def n(self) -> int:
@@ -158,6 +164,13 @@ def fir(g: Array) -> Window:
     return Window(zero, zero, zero, np.array([len(g)], np.int64), np.array([FIR]), g=padded)
 
 
+def adaptive(N: int, short: int, first: int, bounds: Array, e: float) -> Window:
+    """One channel of variable length, ``first`` <= ``short`` <= N; bounds (N,), e = Ed of the channel."""
+    one = fir(bounds)
+    lengths = {"short": np.array([short]), "first": np.array([first])}
+    return replace(one, form=np.array([ADAPTIVE]), S=np.array([[e]]), **lengths)
+
+
 def linear_filter(M: Array, W: Array, S: Array | None = None) -> Window:
     """n channels of the filter rho_k = M rho_{k-1} + v_k - d_hat_{k-1}, d_hat_k = d_hat_{k-1} + W rho_k."""
     n = len(M)
@@ -173,7 +186,7 @@ def side_by_side(*windows: Window) -> Window:
         return Window(**own)
     from scipy.linalg import block_diag  # loads as long as numpy
 
-    rows = {"form": (), "third": (3,), "g": (FIR_MAX,)}
+    rows = {"form": (), "third": (3,), "g": (FIR_MAX,), "short": (), "first": ()}
     for name, shape in rows.items():
         own[name] = np.concatenate([_part(w, name, (*shape, w.n)) for w in windows], axis=-1)
     square = {name: block_diag(*(_part(w, name, (w.n, w.n)) for w in windows)) for name in ("M", "W", "S")}
@@ -234,6 +247,7 @@ def shape_step(p: Any, s: Any) -> None:
     """Write d_hat of the channels of another form than PAIR, after :func:`window_step`; p, s: the records.
 
     FIR: d_hat = sum_j g_j v_{k-j}.  THIRD: d_hat += theta_3 (h_3,k - lam_3^N h_3,k-N).  FILTER: see Window.
+    ADAPTIVE: see :mod:`hil.control.adaptive`.
     """
     v, head, size = s["v"], s["head"], s["past"].shape[0]
     for c in range(3):
@@ -253,6 +267,8 @@ def shape_step(p: Any, s: Any) -> None:
             for j in range(3):
                 total += p["M"][c, j] * s["rho"][j]
             s["work"][c] = total + v[c] - s["d_filter"][c]
+        elif p["form"][c] == ADAPTIVE:
+            adaptive_step(p, s, c)
     for c in range(3):
         if p["form"][c] == FILTER:
             s["rho"][c] = s["work"][c]
@@ -264,24 +280,28 @@ def shape_step(p: Any, s: Any) -> None:
 
 
 @jit
-def shape_fill(s: Any) -> None:
+def shape_fill(p: Any, s: Any) -> None:
     """Fill the memory of the forms of :func:`shape_step` with the steady state of the disturbance s['v']."""
     for c in range(3):
         s["h_3"][c], s["d_filter"][c], s["rho"][c] = s["v"][c], s["v"][c], 0.0
         for j in range(s["past_3"].shape[0]):
             s["past_3"][j, c] = s["v"][c]
+        if p["form"][c] == ADAPTIVE:
+            adaptive_fill(p, s, c)
 
 
 def impulse_response(window: Window, length: int) -> Array:
     """Response of d_hat to a unit impulse of v, per channel; shape (length, n).
 
     w_j = sum_i theta_i (1 - lam_i) lam_i^j for j < N, 0 from N on (a conventional DOB goes on). Of a filter
-    that couples channels it is each channel's response to its own.
+    that couples channels it is each channel's response to its own; of an adaptive window that of its longest.
     """
     weights = _pair_response(window, length)
     for c, form in enumerate(window.form):
         if form == FIR:
             weights[:, c] = np.r_[window.g[:length, c], np.zeros(max(0, length - FIR_MAX))]
+        elif form == ADAPTIVE:
+            weights[:, c] = parabola_weights(int(window.N[c]), length)
         elif form == THIRD:
             lam, lam_N, theta = window.third[:, c : c + 1]
             lam, lam_N, theta = (np.array([a, [0.0]]) for a in (lam, lam_N, theta))
@@ -290,6 +310,13 @@ def impulse_response(window: Window, length: int) -> Array:
         elif form == FILTER:
             weights[:, c] = _filter_response(window, c, length)
     return weights
+
+
+def parabola_weights(N: int, length: int) -> Array:
+    """g of the parabola of N ticks, and zeros; shape (length,)."""
+    j = np.arange(length)
+    g: Array = 6.0 * (j + 1) * np.maximum(N - j, 0) / (N * (N + 1.0) * (N + 2))
+    return g
 
 
 def _filter_response(window: Window, c: int, length: int) -> Array:

@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.control.fac import MAX_GAP
 from hil.control.law import N_MAX, ROWS, SPEED
-from hil.control.observer import FILTER, FIR, FIR_MAX
+from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
 from hil.control.speedfilter import MOST_AVERAGE, PAST
@@ -24,10 +24,12 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "kind": (0, SPEED),
         "max_gap": (1, MAX_GAP),
         "N": (0, N_MAX - 1),
-        "form": (0, FILTER),
+        "form": (0, ADAPTIVE),
         "rows": (0, ROWS),
         "delay": (0, MOST_DELAY),
         "order": (0, MOST_AVERAGE),
+        "short": (0, FIR_MAX),
+        "first": (0, FIR_MAX),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {
@@ -44,6 +46,10 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "row": (0, ROWS),
         "place": (0, PAST - 1),
         "heard": (0, PAST),
+        "length": (0, FIR_MAX),
+        "hold": (0, FIR_MAX),
+        "still": (0, FIR_MAX),
+        "doubt": (0, 1),
     },
 }
 
@@ -54,7 +60,13 @@ def check_ranges(kind: str, record: Record) -> None:
         value: Any = record[name]
         if np.any(value < low) or np.any(value > high):
             raise ValueError(f"{kind}.{name} is {value[0]}, not within {low} to {high}")
-    if kind == "law" and np.any((record["form"] == FIR) & (record["N"] > FIR_MAX)):
-        raise ValueError(f"law.N is {record['N'][0]}, where weights have room for {FIR_MAX}")
-    if kind == "law" and np.any(record["order"]) and not (record["v_y"][0, 0] and record["gap_y"][0].all()):
+    if kind != "law":
+        return
+    form, N = record["form"], record["N"]
+    if np.any(((form == FIR) | (form == ADAPTIVE)) & (N > FIR_MAX)):
+        raise ValueError(f"law.N is {N[0]}, where weights have room for {FIR_MAX}")
+    short, first = record["short"], record["first"]
+    if np.any((form == ADAPTIVE) & ~((first >= 1) & (first <= short) & (short <= N))):
+        raise ValueError(f"law.first, short, N are {first[0]}, {short[0]}, {N[0]}: they do not grow from 1")
+    if np.any(record["order"]) and not (record["v_y"][0, 0] and record["gap_y"][0].all()):
         raise ValueError("law.v_y or law.gap_y is 0, by which a kernel divides")

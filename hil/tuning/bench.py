@@ -61,6 +61,7 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         math.hypot(own.get("i_noise", sensors[1]), lsb[1] / math.sqrt(12)),
         max(u_lsb, setup.wire.u_lsb) / math.sqrt(12),
         _speed(setup),
+        i_d_noise=math.hypot(own.get("i_noise", sensors[1]), lsb[2] / math.sqrt(12)),
         **more,
     )
 

@@ -8,7 +8,7 @@ length: gamma D = 0.3, 0.7.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from hil.errors import HilError
@@ -89,6 +89,25 @@ def _three(ticks: float, bench: Bench) -> dict[str, Any]:
     return {"kind": "exponentials", "gammas_rad_s": gammas, "delay_ms": D, **_noise(bench)}
 
 
+def _adaptive(x: Sequence[float], bench: Bench) -> Tables:
+    """x[2], x[3]: short windows of speed and current; x[4]: the long one of both; the first a sixth.
+
+    One noise is told for both currents: the larger, so that no step of i_d's frame is an alarm.
+    """
+    noise = _noise(replace(bench, i_noise=max(bench.i_noise, bench.i_d_noise)))
+    speed, current = (
+        {
+            "kind": "adaptive",
+            "delay_ms": _ms(max(x[4], short), bench),
+            "short_ms": _ms(short, bench),
+            "first_ms": _ms(short / 6, bench),
+            **noise,
+        }
+        for short in x[2:4]
+    )
+    return {"controller": _cascade(x, bench), "speed": speed, "current": current}
+
+
 def _dob_channel(gamma: float, bench: Bench) -> dict[str, Any]:
     return {"kind": "dob", "gamma_1_rad_s": round(gamma / bench.T_s, 2)}
 
@@ -157,6 +176,7 @@ FAMILIES: Final[dict[str, Family]] = {
         _windowed("least-noise", "least-noise window", _windows(_least)),
         _windowed("cubic", "cubic window", _windows(_cubic)),
         _windowed("exponentials", "three exponentials", _windows(_three)),
+        Family("adaptive", "adaptive window", (*_POLES, *_LENGTH, (16.0, 120.0)), _adaptive, (2, 3, 4)),
         _windowed("ramp-exact", "ramp-exact window", _ramp_tables),
     )
 }
@@ -170,7 +190,7 @@ OTHER_NAMES: Final[Mapping[str, str]] = {
     "least_noise": "least-noise",
     "ramp_exact": "ramp-exact",
 }
-DEFAULT_LAWS: Final = ("pi", "dob", "eso", "kalman", "ftdob", "least-noise", "cubic")
+DEFAULT_LAWS: Final = ("pi", "dob", "eso", "kalman", "ftdob", "least-noise", "cubic", "adaptive")
 
 
 def family(name: str) -> Family:

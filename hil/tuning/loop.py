@@ -21,7 +21,7 @@ Record = npt.NDArray[np.void]
 LOAD, PULSE_W, PULSE_I, PULSE_U = range(4)
 """What disturbs the loop: a unit step of the load, a unit pulse on a measurement or on the voltage."""
 QUIET: Final = 3
-"""Ticks at rest before it: the observer's memory is filled by then."""
+"""Ticks at rest before it, at least: the observer's memory is filled by then."""
 NO_LIMIT: Final = 1e300
 
 
@@ -72,7 +72,11 @@ def respond(p: Any, s: Any, A: Array, b: Array, e: Array, kind: int, out: Array)
     reset(s)
     apply(s, 0.0, 0.0, 0.0)
     u = 0.0
-    for k in range(-QUIET, K):
+    rest = QUIET
+    for c in range(3):
+        if p["short"][c] > 0:  # an adaptive window is to be at its full length
+            rest = max(rest, p["N"][c] + QUIET)
+    for k in range(-rest, K):
         ua = u
         w = x[0] + (1.0 if kind == PULSE_W and k == 0 else 0.0)
         i_q = x[1] + (1.0 if kind == PULSE_I and k == 0 else 0.0)
@@ -99,3 +103,17 @@ def respond_all(p: Any, s: Any, A: Array, b: Array, e: Array, kinds: Any, out: A
     for m in range(A.shape[0]):
         for j in range(kinds.shape[0]):
             respond(p, s, A[m], b[m], e[m], kinds[j], out[m, j])
+
+
+@jit
+def count_alarms(p: Any, s: Any, x: Array) -> int:
+    """How often the adaptive windows of a motor at rest become shorter; x (K, 3): its measured state."""
+    count = 0
+    length = np.zeros(3, np.int64)
+    for k in range(x.shape[0]):
+        observe(p, s, x[k, 0], x[k, 1], x[k, 2], True, 1)
+        for c in range(3):
+            if s["length"][c] < length[c]:
+                count += 1
+            length[c] = s["length"][c]
+    return count

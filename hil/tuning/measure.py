@@ -2,6 +2,8 @@
 
 S = 1 / (1 + L) is the transfer function from a voltage that nobody announced to the voltage at the plant:
     Ms = max |S|,  and from L = 1 / S - 1 gain, phase and delay margin.
+A law with an adaptive window is two linear loops: that of the short window, whose margins count, and that of
+the long one, whose noise it has. Dip, recovery and IAE are of the window as it runs; Ms is the larger one.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -25,6 +27,7 @@ RESPONSE_S: Final = 0.4
 RESTLESS: Final = 0.1
 """Share of the dip that may be left in the last tenth of the response."""
 POINTS: Final = 1 << 11
+_MODES: Final[tuple[Literal["short", "N"], ...]] = ("short", "N")
 _STEP, _NOISE = np.array([LOAD, PULSE_U]), np.array([PULSE_W, PULSE_I])
 
 
@@ -34,7 +37,8 @@ class Bench:
 
     Noises are standard deviations with the resolution in them; at a speed ``w_0`` [rad/s] decoupling adds
     n_p w_0 L_d i_d's noise to u_q; ``spread`` is the share by which J, psi_f, R_s
-    and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with.
+    and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with;
+    ``i_d_noise`` is that of i_d where its frame is coarser than i_q's.
     """
 
     motor: MotorModel
@@ -46,6 +50,7 @@ class Bench:
     w_0: float = 0.0
     spread: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3))
     shafts: tuple[tuple[float, float, float], ...] = ()
+    i_d_noise: float = 0.0
 
     @property
     def ticks(self) -> int:
@@ -110,8 +115,45 @@ def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int) ->
     return out
 
 
+def adapts(law: Record) -> bool:
+    """Whether a window of the law is adaptive."""
+    return bool(law["short"].any())
+
+
+def held(law: Record, name: Literal["short", "N"]) -> Record:
+    """The law with its adaptive windows held at that length; any other law as it is."""
+    own = law.copy()
+    for c in np.flatnonzero(law["short"][0]):
+        own["N"][0, c] = own[name][0, c]
+        own["first"][0, c] = own["short"][0, c]
+        own["g"][0, :, c] = np.inf
+    return own
+
+
+def to_unit_load(law: Record, load: float) -> Record:
+    """The law whose adaptive windows take a load of one for what they take ``load`` for."""
+    own = law.copy()
+    for c in np.flatnonzero(law["short"][0]):
+        own["g"][0, :, c] /= load
+    return own
+
+
 def loops(law: Record, bench: Bench, plants: Sequence[Plant]) -> list[Loop]:
     """The measures with every plant."""
+    if not adapts(law):
+        return _loops(law, bench, plants)
+    laws = (to_unit_load(law, bench.load), held(law, "short"), held(law, "N"))
+    return [_joined(*three) for three in zip(*(_loops(one, bench, plants) for one in laws), strict=True)]
+
+
+def _joined(whole: Loop, short: Loop, long: Loop) -> Loop:
+    """What an adaptive window does, with the larger Ms of its modes; each must be stable by itself."""
+    if not (whole.stable and short.stable and long.stable):
+        return UNSTABLE
+    return replace(whole, ms=max(short.ms, long.ms))
+
+
+def _loops(law: Record, bench: Bench, plants: Sequence[Plant]) -> list[Loop]:
     out = responses(law, plants, _STEP, bench.ticks)
     return [_loop(one[0, 2] * bench.load, one[1, 1], bench.T_s) for one in out]
 
@@ -134,13 +176,16 @@ def peak_of(pulse: Array) -> float:
 
 
 def noise(law: Record, bench: Bench, plant: Plant) -> tuple[float, float]:
-    """Noise of u_q [V] and of the true speed [rad/s], rms, for the noise that the bench has."""
+    """Noise of u_q [V] and of the true speed [rad/s], rms, for the noise that the bench has; at rest."""
+    law = held(law, "N")
     kinds = np.r_[_NOISE, PULSE_U]
     out = responses(law, [plant], kinds, bench.ticks)[0]
     sigma = np.array([bench.w_noise, bench.i_noise, bench.u_noise])
     energy = (out[:, (0, 2)] ** 2).sum(axis=2)
     u, w = np.sqrt((sigma[:, None] ** 2 * energy).sum(axis=0))
     decoupling = bench.motor.n_p * bench.w_0 * bench.motor.L_d * bench.i_noise if law["coupling"][0] else 0.0
+    if F := int(law["N"][0, 2] - law["short"][0, 2]) if law["short"][0, 2] else 0:
+        decoupling *= math.sqrt(2.0 * (2 * F + 1) / ((F + 1) * (F + 2)))  # the end of a line through F + 1
     return math.hypot(float(u), decoupling), float(w)
 
 
@@ -154,8 +199,10 @@ class Margins:
 
 
 def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
-    """Gain margin, phase margin [deg], delay margin [ms] at the plant's voltage."""
-    return asdict(margins_of(responses(law, [plant], _STEP[1:], bench.ticks)[0, 0, 1], bench.T_s))
+    """Gain margin, phase margin [deg], delay margin [ms] at the plant's voltage; of the short window."""
+    return asdict(
+        margins_of(responses(held(law, "short"), [plant], _STEP[1:], bench.ticks)[0, 0, 1], bench.T_s)
+    )
 
 
 def margins_of(pulse: Array, T_s: float) -> Margins:
@@ -179,6 +226,9 @@ def quiet(law: Record, bench: Bench, plants: Sequence[Plant], seconds: float = 1
     """Whether a load step's vibration dies away with each plant: its rms falls from second to last third."""
     if not plants:
         return []
+    if adapts(law):
+        both = (quiet(held(law, name), bench, plants, seconds) for name in _MODES)
+        return [short and long for short, long in zip(*both, strict=True)]
     ticks = round(seconds / bench.T_s)
     w = responses(law, plants, _STEP[:1], ticks)[:, 0, 2] * bench.load
     thirds = [w[:, ticks // 3 * part : ticks // 3 * (part + 1)] for part in (1, 2)]

@@ -34,6 +34,11 @@ def design_table(found: dict[str, Any]) -> Table:
             f"N = {w['N']} (D = {w['D_ms']:g} ms), sigma_d {w['sigma_d']:.3g}, one LSB up to "
             f"{w['lsb_bound']:.3g}, lag {w['lag_ms']:.1f} ms, peak |H| {w['peak_H']:.2f}"
         )
+        if "short_N" in w:
+            rows[f"{name}, after a change"] = (
+                f"N = {w['short_N']}, the first {w['first_N']}; sigma_d {w['short_sigma_d']:.3g}, lag "
+                f"{w['short_lag_ms']:.1f} ms; margins are of this one"
+            )
     margins = found["margins"]
     rows |= {
         "dip, nominal / worst corner": f"{found['dip']:.2f} / {found['worst_dip']:.2f} rad/s",

@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.control.law import LawSpec, law_window, sampled_model
 from hil.control.linalg import Array
-from hil.control.observer import bounds, impulse_response, response_length
+from hil.control.observer import Window, bounds, impulse_response, parabola_weights, response_length
 from hil.tuning.measure import Bench
 
 
@@ -19,9 +19,22 @@ def figures(spec: LawSpec, bench: Bench, lsb: Array) -> dict[str, dict[str, floa
     weights = impulse_response(window, response_length(window))
     limits = bounds(window, model.Ad, model.Ed, bench.T_s, lsb)
     noises = np.array([bench.w_noise, bench.i_noise, bench.i_noise])
-    return {
+    found = {
         name: _channel(weights[:, c], model, bench, noises, c) | {"lsb_bound": float(limits.resolution[c])}
         for c, name in enumerate(("speed", "current"))
+    }
+    for c, own in enumerate(found.values()):
+        if window.short.size and window.short[c]:
+            own |= _after_a_change(window, model, bench, noises, c)
+    return found
+
+
+def _after_a_change(window: Window, model: Any, bench: Bench, noises: Array, c: int) -> dict[str, float]:
+    """Figures of an adaptive channel's short window, and the first length in ticks."""
+    N = int(window.short[c])
+    short = _channel(parabola_weights(N, N), model, bench, noises, c)
+    return {f"short_{key}": short[key] for key in ("N", "D_ms", "sigma_d", "lag_ms")} | {
+        "first_N": int(window.first[c])
     }
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from hil.app import Overrides, load_setup, run
 from hil.cli import main
-from hil.demo import emulator_process
+from hil.demo import emulator_process, own_channel
 from hil.log.check import seal
 from hil.log.errors import LogError
 from hil.log.parts import grouped
@@ -26,6 +26,7 @@ from hil.log.split import Limits, SplitFile
 from hil.replay import replay
 from hil.signals import FIELDS
 from hil.simulate import simulate, simulate_ticks
+from hil.tuning.verify import same_run
 from tests.conftest import CONFIGS
 from tests.logfiles import HEADER, some_frames, some_ticks
 from tests.process.test_run import flags, hil
@@ -268,3 +269,28 @@ def test_killed_right_at_a_split(configs: Path, settings: Settings, tmp_path: Pa
     assert all(replay(one).verdict == "same" for one in found if len(open_log(one).ticks))
     if who == "controller":
         assert log.damage is None and log.result["ended"] == "controller died"
+
+
+def test_an_adaptive_window_is_the_same_on_the_bus_and_in_a_part_that_begins_in_its_growth(
+    tmp_path: Path,
+) -> None:
+    """All that the window knows is in the law's state: length, dwell, how long a measurement stood still."""
+    one = (
+        '{kind="adaptive", delay_ms=40.0, short_ms=12.0, first_ms=2.0, w_noise_rad_s=0.0104, '
+        "i_noise_a=0.0036}"
+    )
+    settings = (
+        "loop.duration_s=2.4", AT_ONCE, f"observer.speed={one}", f"observer.current={one}", "log.split_s=1.0",
+        f'log.folder="{tmp_path}"', 'log.name="a"', 'loop.clock="lockstep"',
+    )  # fmt: skip
+    plant = ('load=[{kind="step", torque_n_m=5.4, at_s=1.99}]',)
+    overrides = Overrides(settings=settings, channel=own_channel("adaptive"))
+    with emulator_process(CONFIGS / "rigid.toml", overrides, plant):
+        run(load_setup(CONFIGS / "rigid.toml", overrides))
+    parts = sorted(tmp_path.glob("*.mcap"))
+    assert [replay(path).verdict for path in parts] == ["same"] * 3
+    bus = np.concatenate([open_log(path).ticks for path in parts])
+    simulated = simulate_ticks(load_setup(CONFIGS / "rigid.toml", overrides), list(plant))
+    assert len(bus) > 2300 and same_run(simulated, bus)
+    state = json.loads(open_log(parts[2]).attachments["state.json"])["law_state"]
+    assert 2 <= state["length"][0] < 40, "the part begins while the window grows"

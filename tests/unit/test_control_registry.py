@@ -33,6 +33,8 @@ OBSERVERS = {
     "harmonic-exact": 'kind="harmonic-exact", delay_ms=60.0, frequency_hz=5.0',
     "exponentials": f'kind="exponentials", gammas_rad_s=[50.0, 100.0, 150.0], {D}',
     "eso": 'kind="eso", bandwidth_rad_s=100.0',
+    "adaptive": 'kind="adaptive", delay_ms=40.0, short_ms=12.0, first_ms=2.0, '
+    "w_noise_rad_s=0.0104, i_noise_a=0.0036",
     "kalman": 'kind="kalman", d_walk_per_s=20000.0, x_noise=0.01, filtered_state=true',
 }
 LAWS = {

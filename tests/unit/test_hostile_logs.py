@@ -15,6 +15,7 @@ from websockets.http11 import Request
 
 from hil.cli import main
 from hil.control.law import N_MAX
+from hil.control.observer import ADAPTIVE
 from hil.log.container import encode
 from hil.log.mcapfile import RunFile
 from hil.log.reader import EVENT_TEXT_MOST, EVENTS_MOST, Log, open_log
@@ -69,6 +70,23 @@ def test_what_a_kernel_indexes_by_is_refused_out_of_its_range(record: str, name:
         log.attachments[file] = json.dumps(given)
         verdict = replay_log(log)
         assert verdict.verdict == "cannot" and f"{record}.{name}" in verdict.why
+
+
+@pytest.mark.parametrize(
+    ("N", "short", "first", "said"),
+    [(257, 20, 2, "have room for 256"), (40, 0, 0, "do not grow"), (40, 41, 2, "do not grow"),
+     (40, 12, 13, "do not grow"), (40, 12, 0, "do not grow")],
+)  # fmt: skip
+def test_lengths_of_an_adaptive_window_that_can_not_be_are_refused(
+    N: int, short: int, first: int, said: str
+) -> None:
+    log = named(open_log(PART))
+    given = json.loads(log.attachments["controller.json"])
+    for name, value in (("form", ADAPTIVE), ("shaped", 1), ("N", N), ("short", short), ("first", first)):
+        given["law"][name] = [value] * 3 if name != "shaped" else value
+    log.attachments["controller.json"] = json.dumps(given)
+    verdict = replay_log(log)
+    assert verdict.verdict == "cannot" and said in verdict.why
 
 
 def test_state_of_another_length_is_refused() -> None:
