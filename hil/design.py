@@ -18,6 +18,7 @@ from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
 from hil.control.registry import InnerLoop, SpeedFilter
+from hil.control.speedfilter import MOST_AVERAGE
 from hil.guard import MEASURED, MOST_MESSAGES, NO_I_D, NO_I_Q, SAFETY_PARAMS
 from hil.kernel import PLACED, new_safety_state, step, whole, whole_at
 from hil.log.named import to_named
@@ -155,7 +156,10 @@ def _values(table: Any) -> dict[str, Any]:
 
 
 def speed_filter(given: Any, rate_hz: int) -> SpeedFilter | None:
-    """What a table ``speed_filter`` of a drive means; None for nothing. Raises ControlDesignError."""
+    """What a table ``speed_filter`` means; None for nothing. Raises ControlDesignError.
+
+    A mean that the observer is to know is one over whole periods; any other is taken for the nearest.
+    """
     if given.kind == "first-order":
         return SpeedFilter((given.pole_rad_s,))
     if given.kind == "pll":
@@ -163,12 +167,18 @@ def speed_filter(given: Any, rate_hz: int) -> SpeedFilter | None:
     if given.kind == "none":
         return None
     periods = given.window_ms * 1e-3 * rate_hz
-    if round(periods) < 1 or abs(periods - round(periods)) > 1e-6 * periods:
+    if periods > MOST_AVERAGE + 0.5:
+        raise ControlDesignError(
+            f"drive.speed_filter.window_ms = {given.window_ms:g}: {periods:g} periods, and {MOST_AVERAGE} "
+            "are kept at most; lower loop.rate_hz, or set a shorter window in the drive"
+        )
+    known = getattr(given, "modelled", False)
+    if known and (round(periods) < 1 or abs(periods - round(periods)) > 1e-6 * periods):
         raise ControlDesignError(
             f"drive.speed_filter.window_ms = {given.window_ms:g}: no whole number of periods at {rate_hz} "
             "Hz; change loop.rate_hz, or the drive's window"
         )
-    return SpeedFilter(ticks=round(periods))
+    return SpeedFilter(ticks=round(periods)) if round(periods) else None
 
 
 def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:

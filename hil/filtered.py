@@ -9,6 +9,7 @@ import math
 from typing import TYPE_CHECKING, Any, Final
 
 from hil.config import RunConfig
+from hil.control.errors import ControlDesignError
 from hil.control.registry import SpeedFilter
 from hil.design import Machine, inner_loop, motor_model, speed_filter
 from hil.errors import ConfigError
@@ -23,7 +24,7 @@ LEAST_PHASE_DEG, LEAST_GAIN, MOST_MS = 30.0, 1.7, 2.5
 MOST_NOISE: Final = 0.02
 """Noise of the command, of what the law may ask for, above which it is said."""
 ROW: Final = "speed filter"
-OWN: Final = "drive.speed_filter is what the drive has, poles and kind"
+OWN: Final = "write the kind and the poles of the drive's own filter into drive.speed_filter"
 
 
 def loop_through(config: RunConfig, machine: Machine, given: SpeedFilter | None) -> Loop:
@@ -87,15 +88,18 @@ def filter_rows(setup: Setup, real: Any = None, w_noise: float = 0.0) -> list[Ro
     if config.drive.takes == "voltage":
         return []
     real = real or told
-    given, believed = (speed_filter(table, config.loop.rate_hz) for table in (real, told))
+    try:
+        given, believed = (speed_filter(table, config.loop.rate_hz) for table in (real, told))
+    except ControlDesignError as error:  # of the real one: no run begins with such a one told
+        return [Row(ROW, "warn", f"the emulated drive has {words(real)}: {error}", "take a shorter one")]
     loop = loop_through(config, setup.machine, given)
     what = _which(real, told, given == believed)
     if not loop.stable:
-        return [Row(ROW, "fail", f"{what}: the loop is not stable", f"tell it: {OWN}")]
+        return [Row(ROW, "fail", f"{what}: the loop is not stable", OWN)]
     noise = math.hypot(w_noise, setup.wire.x_lsb[0] / math.sqrt(12.0))
     found = f"{what}: {_figures(config, loop, noise)}"
     if given != believed:
-        return [Row(ROW, "warn", found, f"tell it: {OWN}")]
+        return [Row(ROW, "warn", found, OWN)]
     if near_its_limit(loop):
         return [Row(ROW, "warn", found, "take a longer delay_ms and a lower speed_pole_rad_s")]
     if loop.u_noise * noise > MOST_NOISE * config.command.most:
@@ -108,8 +112,11 @@ def _which(real: Any, told: Any, same: bool) -> str:
     """The filter, and what is known of it."""
     if not same:
         return f"the emulated drive has {words(real)}, drive.speed_filter tells {words(told)}"
-    if told.kind == "none":
-        return words(told)
+    return words(told) if told.kind == "none" else known(told)
+
+
+def known(told: Any) -> str:
+    """A filter in words, and whether the observer knows it."""
     return f"{words(told)}, which the observer {'knows' if told.modelled else 'does not know'}"
 
 

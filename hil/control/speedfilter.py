@@ -163,10 +163,6 @@ def filter_params(inner: InnerLoop | None, friction: float, gain: float, T_s: fl
     v_u, v_s, v_d = _known(r, rows, none, (G, S, E))
     w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n)[: n - 1], (G, S, E))
     scale = -math.fsum(v_d)
-    if not 0.0 < scale < math.inf:
-        raise ControlDesignError(
-            "drive.speed_filter: too slow for loop.rate_hz: no sample shows a disturbance"
-        )
     steps = np.array([dot(row, E) for row in rows])
     return {
         "order": n - 1,

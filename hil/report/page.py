@@ -13,6 +13,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any, Final
 
+from hil.filtered import known
 from hil.report.collect import Run
 from hil.report.criteria import (
     FIGURES,
@@ -120,6 +121,8 @@ def _facts(run: Run) -> str:
         or "nothing unusual",
         "states": ", ".join(f"{name} {count}" for name, count in totals.states.items() if count),
     }
+    if config and config.drive.speed_filter.kind != "none":
+        facts["speed filter"] = known(config.drive.speed_filter)
     rows = ((escape(name), escape(text)) for name, text in facts.items())
     return f"<div>{table(('run', ''), rows, False)}</div>"
 

@@ -11,6 +11,7 @@ from scipy.linalg import expm
 
 from hil.app import Overrides, Setup, load_setup
 from hil.check import reach_rows, speed_filter_rows
+from hil.config import MovingAverageFilter
 from hil.control.law import (
     LAW_PARAMS,
     ChannelSpec,
@@ -21,12 +22,14 @@ from hil.control.law import (
     new_law_state,
     observe,
 )
-from hil.control.registry import InnerLoop
+from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speed import flowed, latched
+from hil.design import speed_filter
 from hil.errors import HilError
 from hil.filtered import filter_rows
 from hil.metrics import operating
 from hil.replay import replay
+from hil.report.build import build
 from hil.report.curves import plots_of
 from hil.signals import GuardFlag, Reason, TickArray
 from hil.simulate import simulate, simulate_ticks
@@ -189,6 +192,9 @@ def test_through_a_slow_pll_the_loop_diverges_unless_it_is_told(tmp_path: Path) 
     assert replay(log).verdict == "same"
     again = what_if(log, PATH, setup.config)  # the same controller beside itself
     assert again.spreads["T_L_hat"].count > 3000 and again.spreads["T_L_hat"].rms < 1e-9
+    page = build([log], tmp_path / "page.html", verify=False)
+    assert page.runs[0].N[0] == 12  # D, though the window is shorter by the filter's states
+    assert "a PLL with poles of 15 and 1985 rad/s, which the observer knows" in page.path.read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -201,6 +207,10 @@ def test_through_a_slow_pll_the_loop_diverges_unless_it_is_told(tmp_path: Path) 
         ),
         (('drive.speed_filter={kind="moving-average",window_ms=3.5}',), "no whole number of periods at 1000"),
         (('drive.speed_filter={kind="moving-average",window_ms=12.0}',), "take 12 ms of it, and nothing is"),
+        (
+            ('drive.speed_filter={kind="moving-average",window_ms=33.0,modelled=false}',),
+            "33 periods, and 32 are",
+        ),
         (('drive.speed_filter={kind="pll",pole_1_rad_s=9.0}',), "drive.speed_filter.pole_2_rad_s: missing"),
         (('drive.speed_filter={kind="notch"}',), "drive.speed_filter: input tag 'notch'"),
         (('drive.speed_filter="pll"',), "drive.speed_filter: must be a table"),
@@ -217,6 +227,7 @@ def test_a_drive_that_takes_voltages_is_told_no_filter() -> None:
         load_setup(CONFIGS / "demo.toml", Overrides(settings=(f"drive.speed_filter={PLL}",)))
 
 
+@pytest.mark.compiled
 def test_check_says_what_the_filter_does_to_the_loop(tmp_path: Path) -> None:
     plain, told = setup_of(), setup_of(f"drive.speed_filter={PLL}")
     unknown = setup_of(f"drive.speed_filter={PLL[:-1]},modelled=false}}")
@@ -246,6 +257,21 @@ def test_check_says_what_the_filter_does_to_the_loop(tmp_path: Path) -> None:
     assert odrive.verdict == "pass" and "which the observer knows" in odrive.found
     (broken,) = speed_filter_rows(setup_of('emulator.plant="none.toml"'))
     assert broken.verdict == "warn" and "none.toml" in broken.found
+
+
+@pytest.mark.compiled
+def test_a_mean_that_the_observer_does_not_know_need_not_be_of_whole_periods() -> None:
+    def mean(window_ms: float) -> Any:
+        return MovingAverageFilter(kind="moving-average", window_ms=window_ms, modelled=False)
+
+    setup = setup_of('drive.speed_filter={kind="moving-average",window_ms=3.6,modelled=false}')
+    assert not setup.machine.law["order"].any()
+    assert [speed_filter(mean(ms), 1000) for ms in (3.6, 0.4)] == [SpeedFilter(ticks=4), None]
+    near, long = (filter_rows(setup_of(), mean(window_ms))[0] for window_ms in (3.6, 40.0))
+    assert (
+        near.verdict == "warn" and "has a moving average of 3.6 ms, drive.speed_filter tells no" in near.found
+    )
+    assert long.verdict == "warn" and "40 periods, and 32 are kept at most" in long.found
 
 
 def torque_setup(folder: Path, *settings: str) -> Setup:

@@ -207,6 +207,7 @@ def test_to_undo_a_filter_costs_noise_and_a_mean_costs_none() -> None:
     assert all(amplified[given] == pytest.approx(1.0, abs=1e-3) for given in FILTERS[3:])
 
 
+@pytest.mark.compiled
 def test_the_loop_is_as_good_as_without_the_filter_when_it_is_known_and_bad_when_not() -> None:
     def loop(known: SpeedFilter | None, real: SpeedFilter | None) -> Any:
         inner = dataclasses.replace(untold(ODRIVE), told=True, filter=known)
