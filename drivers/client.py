@@ -154,6 +154,8 @@ class DriveClient:
         for out in self._outgoing:
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
             out.encode = partial(entry(encode_command, *args, 0), *args)
+            noting = (self._log, self._state, out.raw)
+            out.note = partial(entry(note_sent, *noting, 0), *noting)
         self._on_change = dict.fromkeys(self.binding.map.on_change, b"")
         """What of those messages was sent last."""
         self._stops = [self._stop_frames(out) for out in self._outgoing]
@@ -444,11 +446,17 @@ class DriveClient:
             if self._polls and self._sync is not None:
                 self._sync.raw[: len(out.raw)] = out.raw
             elif out.message.name not in self._on_change:
-                self._transmit(out)
+                self._send_noted(out, now_ns)
             elif (data := bytes(out.view[DATA_AT:])) != self._on_change[out.message.name]:
-                self._transmit(out)
+                self._send_noted(out, now_ns)
                 self._on_change[out.message.name] = data
         self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
+
+    def _send_noted(self, out: Outgoing, now_ns: int) -> None:
+        """Send a command; of several the last that was laid out stands in the log's next place."""
+        if len(self._outgoing) > 1:
+            out.note(now_ns)
+        self._transmit(out)
 
     def _note_state(self, controlword: int) -> None:
         """A drive that does not say its state is taken to be where the command leads."""

@@ -26,6 +26,7 @@ class Outgoing:
         self.raw = laid_out(message.send_id, message.length, message.fd)
         self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
         self.encode: Send = lambda t_ns: -1
+        self.note: Send = lambda t_ns: -1
 
     def lay(self, raw: npt.NDArray[np.uint8]) -> None:
         """Take a buffer that is laid out, its frame first."""

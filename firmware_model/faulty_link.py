@@ -90,7 +90,8 @@ class Injector:
 class FaultyLink:
     """A link that does to frames what a script says. ``now_ns`` is plant time.
 
-    ``acted`` counts by the fault's place in the script what each of them did.
+    ``acted`` counts by the fault's place in the script what each of them did. ``sync_id``: what moves the
+    drive on where the DBC has no SYNC.
     """
 
     def __init__(
@@ -103,11 +104,12 @@ class FaultyLink:
         now_ns: Callable[[], int] = lambda: 0,
         lost_sync: Callable[[], None] = nothing,
         acted: Counter[int] | None = None,
+        sync_id: int | None = None,
     ) -> None:
         self._link, self._lockstep = link, lockstep
         self.now_ns, self.lost_sync = now_ns, lost_sync
         sync = database.optional("SYNC")
-        self._sync_id = sync.send_id if sync else None
+        self._sync_id = sync.send_id if sync else sync_id
         self._acted = Counter[int]() if acted is None else acted
         self._silent = [
             (place, fault) for place, fault in enumerate(faults) if isinstance(fault, (BusOff, BrownOut))

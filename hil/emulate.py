@@ -37,11 +37,14 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     link: Link = open_link(bus_settings(config))
     lockstep = config.loop.clock == "lockstep"
     acted = Counter[int]()
-    faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted) if plant.fault else None
     eds = folder / plant.eds if plant.eds else None
     frames = frames_of(database, plant.protocol, eds=(eds, {}) if eds else None)
     if frames.spoken is not None:
         check_spoken(path, config, frames.spoken)
+    faulty = None
+    if plant.fault:
+        opener = frames.sync_id
+        faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted, sync_id=opener)
     modulus = frames.counter_modulus
     watched = plant.fault or plant.black_box
     node = Node(

@@ -27,6 +27,7 @@ from typing import Any, Final
 
 from drivers.bus import open_link
 from drivers.errors import DriverError
+from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from firmware_model.node import BLACK_BOX
 from hil.app import Overrides, Setup, bus_settings, load_setup, run
 from hil.emulate import load_plant, serve
@@ -265,11 +266,11 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
     onset_s = row.onset_s
     if onset_ns is not None and len(log.ticks):
         onset_s = (onset_ns - int(log.ticks["t_ns"][0])) * 1e-9
-    command = setup.database.message("COMMAND", "VoltageQ", "VoltageD")
-    reader = command.reader("VoltageQ", "VoltageD")
+    command = setup.binding.command
+    reader = command.message.reader(*(n for part, n in command.parts if part in (*COMMANDED_Q, *COMMANDED_D)))
     reason = int(ended) if ended.isdecimal() else None
-    evidence = Evidence(log, black_box(said), reason, onset_s, row.host, acted)
-    judge(result, row.expect, evidence, setup.config.command.most, reader, command.can_id)
+    evidence = Evidence(log, black_box(said), reason, onset_s, row.host, acted, setup.binding.map.poll != "")
+    judge(result, row.expect, evidence, setup.config.command.most, reader, command.message.send_id)
     verdict = replay_log(log)
     result.replay = verdict.verdict
     if verdict.verdict != "same":
@@ -284,8 +285,9 @@ def check_rows(path: Path, matrix: Matrix, rows: list[Row]) -> Setup:
         try:
             setup = load_setup(path, Overrides(settings=matrix.settings(row)))
             plant, _ = load_plant(path, setup.config, matrix.plant_settings(row))
-            for message in {getattr(fault, "message", "FEEDBACK") for fault in plant.fault}:
-                setup.database.message(message)
+            for fault in plant.fault:
+                if message := getattr(fault, "message", ""):
+                    setup.database.message(message)
         except (HilError, DriverError) as error:
             found = error.problems if isinstance(error, ConfigError) else [str(error)]
             problems += [f"row {row.name!r}: {problem}" for problem in found]

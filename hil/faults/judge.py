@@ -66,6 +66,8 @@ class Evidence:
     onset_s: float
     host: Any = None
     host_acted: bool = True
+    asked: bool = False
+    """The drive is asked by its command: what goes out at a tick's begin is the last tick's."""
 
 
 def faulty_stop(ticks: TickArray) -> int | None:
@@ -105,7 +107,7 @@ def judge(
     _judge_faults(result, evidence)
     _judge_limits(result, expect, u_max)
     _judge_log(result, expect, log)
-    _judge_frames(result, log, command_id, read_command)
+    _judge_frames(result, log, command_id, read_command, evidence.asked)
 
 
 def _judge_stop(
@@ -187,16 +189,21 @@ def _judge_log(result: Result, expect: Expect, log: Log) -> None:
         result.why.append(f"log: {log.damage or 'ticks are missing'}")
 
 
-def _judge_frames(result: Result, log: Log, command_id: int, read_command: ReadCommand) -> None:
+def _judge_frames(
+    result: Result, log: Log, command_id: int, read_command: ReadCommand, asked: bool = False
+) -> None:
     """No logged command frame carries voltage from the tick of the stop on.
 
-    That tick begins when the loop woke up for it: a late tick before it may send past its nominal time.
+    That tick begins when the loop woke up for it: a late tick before it may send past its nominal time. Where
+    the drive is ``asked`` by its command, that tick's own goes out once it is computed.
     """
     reasons = log.ticks["reason"] != 0
     if not reasons.any():
         return
     tick = log.ticks[int(np.argmax(reasons))]
     stop_ns = int(tick["t_ns"]) + max(0, int(tick["lateness_ns"]))
+    if asked:
+        stop_ns = int(tick["t_ns"]) + max(0, int(tick["computed_ns"])) + 1
     sent = [f for f in log.frames if not f.received and f.can_id == command_id and f.t_ns >= stop_ns]
     if any(any(value != 0.0 for value in read_command(frame.data)) for frame in sent):
         result.why.append("voltage was sent after the stop")

@@ -16,6 +16,7 @@ from drivers.bus import BusSettings, Frame, Link, open_link
 from drivers.client import DriveClient
 from drivers.errors import DatabaseError
 from drivers.oneshot import NoAnswer
+from drivers.wire import FRAME
 from firmware_model.odrive import ODriveFrames
 from hil.app import Overrides, Setup, load_setup
 from hil.demo import closed_loop
@@ -41,7 +42,13 @@ class Bus:
         settings = BusSettings("hil-local", channel, 1_000_000, None, False)
         setup = setup_of()
         self.other: Link = open_link(settings)
-        self.client = DriveClient(open_link(settings), setup.database, drive_map=setup.binding.map)
+        self.log: list[bytes] = []
+        self.client = DriveClient(
+            open_link(settings),
+            setup.database,
+            drive_map=setup.binding.map,
+            on_frames=lambda records: self.log.append(bytes(records)),
+        )
 
     def heard(self) -> list[tuple[int, bytes]]:
         frames: list[tuple[int, bytes]] = []
@@ -85,6 +92,9 @@ def test_the_axis_state_is_sent_when_it_changes_and_with_each_stop(bus: Bus) -> 
     assert [data for can_id, data in sent if can_id == STATE] == [struct.pack("<Q", 1), struct.pack("<Q", 8)]
     torques = [data for can_id, data in sent if can_id == TORQUE]
     assert torques == [struct.pack("<fxxxx", 0.0)] * 3 + [struct.pack("<fxxxx", 1.5)] * 3
+    bus.client.flush()
+    logged = np.frombuffer(b"".join(bus.log), FRAME)
+    assert [(int(f["can_id"]), f["data"][: f["size"]].tobytes()) for f in logged] == sent
     bus.client.stop()
     stopped = bus.heard()
     assert stopped == [(STATE, struct.pack("<Q", 1)), (TORQUE, bytes(8))] * 5

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 
 from hil.config import load_toml
-from hil.faults.case import run_row
-from hil.faults.matrix import ClockStep, Matrix
+from hil.faults.case import check_rows, run_row
+from hil.faults.matrix import ClockStep, Matrix, load_matrix
 from hil.log.reader import open_log
 from hil.signals import FIELDS
 from tests.conftest import CONFIGS
@@ -40,6 +40,25 @@ def test_rows_in_lockstep(tmp_path: Path) -> None:
     assert by_name["frame drop: a tenth of the feedback"]["time_to_safe_ms"] is None
     text = page.read_text(encoding="utf-8")
     assert text.count("<figure>") == len(rows) and "http" not in text
+
+
+@pytest.mark.parametrize(
+    ("drive", "names", "safe_ms"),
+    [
+        ("moteus", ["commands", "bus-off"], [None, 19, 19]),
+        ("odrive", ["torques: none", "sag"], [49, 3]),
+    ],
+)
+def test_rows_of_drives_by_others(
+    drive: str, names: list[str], safe_ms: list[int | None], tmp_path: Path
+) -> None:
+    own, path = load_matrix(CONFIGS / f"faults/{drive}.toml", CONFIGS / "faults.toml")
+    check_rows(path, own, own.row)  # all of them load
+    only = [word for name in names for word in ("--only", name)]
+    code, rows = run(CONFIGS / f"faults/{drive}.toml", tmp_path, *only)
+    assert code == 0, rows
+    found = [row["time_to_safe_ms"] for row in rows]
+    assert [one if one is None else round(one) for one in found] == safe_ms
 
 
 def test_rows_in_real_time(tmp_path: Path) -> None:

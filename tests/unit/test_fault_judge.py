@@ -45,12 +45,16 @@ def test_silence_is_counted_from_one_wake_up_to_the_next() -> None:
     assert silence_ms(ticks_at(0.0)) == 0.0
 
 
-@pytest.mark.parametrize(("sent_ms", "good"), [(2.2, True), (2.4, False)])
-def test_a_stop_begins_when_its_tick_woke_up(sent_ms: float, good: bool) -> None:
+@pytest.mark.parametrize(
+    ("sent_ms", "asked", "good"),
+    [(2.2, False, True), (2.4, False, False), (2.4, True, True), (2.5, True, True), (2.6, True, False)],
+)
+def test_a_stop_begins_when_its_tick_woke_up(sent_ms: float, asked: bool, good: bool) -> None:
     ticks = ticks_at(0.0, 1.0, 2.3)
+    ticks["computed_ns"][2] = 500_000
     ticks["reason"][2] = int(Reason.BUS_DOWN)
     frame = SimpleNamespace(received=False, can_id=COMMAND_ID, t_ns=round(sent_ms * 1e6), data=b"\x01\x00")
     log: Any = SimpleNamespace(ticks=ticks, frames=[frame])
     result = Result("", "")
-    _judge_frames(result, log, COMMAND_ID, lambda data: tuple(map(float, struct.unpack("<h", data))))
+    _judge_frames(result, log, COMMAND_ID, lambda data: tuple(map(float, struct.unpack("<h", data))), asked)
     assert (result.why == []) == good
