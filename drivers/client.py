@@ -22,6 +22,7 @@ from drivers.bcm import KernelSync, all_but
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
 from drivers.codec import Database, Message
+from drivers.drive import Drive, DriveKind, OnFrames, Opens
 from drivers.errors import EncodeError, LinkDown, LinkError
 from drivers.frames import (
     BUS_DOWN,
@@ -71,10 +72,11 @@ START: Final = 0x01
 PRE_OPERATIONAL: Final = 0x80
 """NMT commands of CiA 301."""
 DOWN: Final = "the bus was down; nothing more is sent"
-OnFrames = Callable[[memoryview], None]
-"""Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
 _GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _DOWN = range(9)
 _MISSING_AT: Final = (STATE.names or ()).index("missing_at")
+MAX_NS: Final = 2**63 - 1
+ASK_EVERY_NS: Final = 500_000_000
+"""How long an answer is waited for before a drive is asked again; in lockstep each request is a period."""
 FLUSH_AT: Final = 64
 """Frames that are handed on together: one tick has about four."""
 
@@ -85,12 +87,14 @@ def _offset(tick: Any, name: str) -> int:
     return at
 
 
-def precompile(database: Database, drive_map: DriveMap | None, load: bool, tick: Any) -> None:
+def precompile(
+    database: Database, drive_map: DriveMap | None, load: bool, tick: Any, opens: Opens | None = None
+) -> None:
     """Compile every kernel of a client, or load it, on sockets that lead nowhere."""
     ends = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with ends[0], ends[1]:
         link = SocketLink(None, *ends)
-        DriveClient(link, database, load=load, drive_map=drive_map).prepare(tick)
+        (opens or DriveClient)(link, database, load=load, drive_map=drive_map).prepare(tick)
 
 
 class DriveClient:
@@ -164,17 +168,26 @@ class DriveClient:
         self._started, self._left = (self._nmt_frame(command) for command in (START, PRE_OPERATIONAL))
 
     def _opening(self) -> Outgoing | None:
-        """What begins the drive's cycle: SYNC, or the command it answers, off until one is laid over it."""
-        opener = self.binding.opener
+        """What begins the drive's cycle: SYNC, a request, or the command it answers, off until laid."""
+        opener, self._asks = self.binding.opener, self.request()
         if opener is None:
             return None
         out = Outgoing(opener, 0)
         if self._polls:
             out.lay(np.tile(self._stops[-1][0].raw, 2))
+        elif self._asks is not None:
+            out.view[DATA_AT : DATA_AT + opener.length] = self._asks
         else:
             out.raw[4] = min(opener.length, 1)
         self._note_when_sent(out)
         return out
+
+    def request(self) -> bytes | None:
+        """The data with which the message ``sync`` asks the drive; None: it is CANopen's SYNC.
+
+        What a request/response drive says of its own; it must command nothing.
+        """
+        return None
 
     def _stop_frames(self, out: Outgoing) -> list[Outgoing]:
         """The stop frames of one message, ready to be sent, by the command's counter. Raises EncodeError."""
@@ -228,7 +241,7 @@ class DriveClient:
             self._drain_socket = self._port.drainer(
                 own, _offset(tick, "rx_flags"), _offset(tick, "drive_state")
             )
-            if self._sync is not None:
+            if self._sync is not None and self._asks is None:
                 size = len(self._sync.view)
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
             if len(self._outgoing) == 1:
@@ -305,8 +318,8 @@ class DriveClient:
         if self._sync is None:
             return
         self._cells[_SYNCS] = count = self._cells[_SYNCS] % SYNC_COUNTS + 1
-        if self._sync.raw[4] == 1:
-            self._sync.view[8] = count
+        if self._asks is None and self._sync.raw[4] == 1:
+            self._sync.view[DATA_AT] = count
         self._sync.encode(self._now())
         try:
             self._transmit(self._sync)
@@ -610,11 +623,15 @@ class DriveClient:
                 self.seen[frame.can_id] += 1
         return self.seen
 
-    def wait_for_drive(self, timeout_s: float) -> bool:
-        """Wait for the drive's heartbeat or feedback; sends nothing."""
-        end = time.monotonic_ns() + round(timeout_s * 1e9)
-        while (left := end - time.monotonic_ns()) > 0:
-            frame = self._link.receive(left)
+    def wait_for_drive(self, timeout_s: float, ask: bool = False) -> bool:
+        """Wait for the drive's heartbeat or feedback; sends nothing unless it is to ``ask``."""
+        now = time.monotonic_ns()
+        end, next_ns = now + round(timeout_s * 1e9), now if ask else MAX_NS
+        while (now := time.monotonic_ns()) < end:
+            if now >= next_ns:
+                next_ns = now + ASK_EVERY_NS
+                self._send_sync()
+            frame = self._link.receive(min(end, next_ns) - now)
             if frame is not None and frame.can_id | frame.flags in self._alive:
                 self._note_length(frame)
                 return True
@@ -647,3 +664,7 @@ class DriveClient:
         if self._timed is not None:
             self._timed.close()
         self._link.close()
+
+
+MEMBER: Final = DriveKind("CANopen's SYNC or the drive's own clock, as DBC and map say", DriveClient)
+_IS_ONE: type[Drive] = DriveClient

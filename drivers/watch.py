@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from drivers.binding import Binding
-from drivers.client import OnFrames
+from drivers.drive import OnFrames
 from drivers.errors import DatabaseError
 from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from drivers.wire import FRAME

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from drivers.bus import Frame
 from firmware_model.config import Wire
+from firmware_model.dialects import Dialect, Eds, Synchronous
 from firmware_model.drive import gates_off, transition
 from firmware_model.kernels import Kernels
 from firmware_model.objects import OFF, RPDOS, TPDOS, Mapped, Objects, Sent
@@ -52,7 +53,7 @@ SPEED_GAIN, SPEED_TIME, POSITION_GAIN = 40.0, 0.05, 15.0
 SHUTDOWN: Final = 0x06
 
 
-class Cia402Frames:
+class Cia402Frames(Synchronous):
     """What the node reads and writes. ``ignored`` counts frames that it could not take."""
 
     sync_id: int | None = 0x080
@@ -321,3 +322,11 @@ _LIVE: Final[dict[int, Callable[[Cia402Frames, Kernels], float]]] = {
     0x6079: lambda node, drive: round(drive.sample["v_dc"] * 1e3),
 }
 """Objects that the drive measures or knows."""
+
+
+def _frames(database: Any, _truth: bool, eds: Eds | None) -> Cia402Frames:
+    path, stored = eds or (Path(), {})
+    return Cia402Frames(path, database.node.node_id, stored)
+
+
+MEMBER: Final = Dialect("CANopen, mute until hil configure has mapped its PDOs", _frames, eds=True, wire=WIRE)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
+from firmware_model.dialects import dialect, dialects
 from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.loads.step import StepLoad
 from firmware_model.plant import MAX_LOADS, MOST_SLOTS, PARAMETERS, PARAMS, SAMPLE, STATE, State, code_of
@@ -225,7 +226,10 @@ class Firmware(Table):
 
 if typing.TYPE_CHECKING:
     Load = Any
+    Spoken = str
 else:
+    Spoken = Literal[dialects()]
+    """A protocol (:mod:`firmware_model.dialects`)."""
     _TABLES = tuple(member.table for member in loads().values())
     Load = Annotated[typing.Union[_TABLES], Field(discriminator="kind")]  # noqa: UP007 - of a tuple
     """A load: a table of each registered kind (:mod:`firmware_model.loads`)."""
@@ -257,10 +261,10 @@ class PlantConfig(Table):
     """Path of the DBC that the drive speaks, relative to this file."""
     node_id: Annotated[int, Field(ge=1, le=127)] = 1
     """Number of the drive on the bus."""
-    protocol: Literal["house", "inverter", "cia402", "odrive", "moteus"] = "house"
+    protocol: Spoken = "house"
     """The house protocol (docs/protocol.md); inverter: CAN FD, 29-bit identifiers, no SYNC and no echo;
     cia402: CANopen, mute until hil configure has mapped its PDOs; odrive: CAN Simple; moteus: its
-    register protocol over CAN FD."""
+    register protocol over CAN FD; or a package's entry point hil.emulated."""
     eds: str = ""
     """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"
@@ -298,8 +302,8 @@ class PlantConfig(Table):
 
     @model_validator(mode="after")
     def _has_its_eds(self) -> PlantConfig:
-        if bool(self.eds) != (self.protocol == "cia402"):
-            raise ValueError('eds and protocol = "cia402" belong together')
+        if bool(self.eds) != dialect(self.protocol).eds:
+            raise ValueError('eds and a protocol that needs one, as "cia402", belong together')
         return self
 
     @model_validator(mode="after")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -13,13 +13,12 @@ from drivers.bus import Frame
 from drivers.codec import Database, Message
 from drivers.errors import DatabaseError
 from firmware_model.config import Wire
+from firmware_model.dialects import Dialect, Sent, Synchronous
 from firmware_model.kernels import Kernels
 
 VOLTAGE_MODE, CURRENT_MODE = 0, 1
 COMMANDED: Final = {"VoltageQ": VOLTAGE_MODE, "CurrentQ": CURRENT_MODE}
 """The mode that a command must have, by the signal that its DBC has in it."""
-Sent = tuple[int, bytes, bool]
-"""Identifier as it stands in the frame, data, FD."""
 MEASURED: Final = {
     "Echo": "echo", "Speed": "w", "CurrentQ": "i_q", "CurrentD": "i_d", "State": "state",
     "Limited": "limited",
@@ -37,11 +36,9 @@ LAST_COMMAND, LAST_LOAD, FIRST_ANSWER = range(3)
 """Places in a drive's counters: of the last command and load, then of each answer."""
 
 
-class HouseFrames:
+class HouseFrames(Synchronous):
     """What the drive reads and writes. ``ignored`` counts frames that are not whole, valid and fresh."""
 
-    due: Sequence[Sent] = ()
-    """It answers to nothing but SYNC."""
     beat_ns = 100_000_000
 
     def __init__(self, database: Database, *, truth: bool) -> None:
@@ -167,3 +164,8 @@ class HouseFrames:
                 values["Counter"] = self._counters[place]
             frames.append((message.can_id, message.encode(values), message.fd))
         return frames
+
+
+MEMBER: Final = Dialect(
+    "the house protocol (docs/protocol.md)", lambda database, truth, eds: HouseFrames(database, truth=truth)
+)

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 from drivers.bus import Frame
 from firmware_model.config import Wire
-from firmware_model.house import Sent
+from firmware_model.dialects import Dialect, Sent, Synchronous
 from firmware_model.kernels import Kernels
 from firmware_model.plant import State
 
@@ -35,10 +35,9 @@ def int24(value: float) -> bytes:
     return int(min(max(round(value), -TOP), TOP)).to_bytes(3, "big", signed=True)
 
 
-class InverterFrames:
+class InverterFrames(Synchronous):
     """What this inverter reads and writes. ``ignored`` counts frames that it did not take."""
 
-    due: Sequence[Sent] = ()
     beat_ns = 0
     sync_id: int | None = None
     counter_modulus = 16
@@ -122,3 +121,9 @@ def controlword(state: Any, on: bool, clear: bool) -> int:
     return {int(State.SWITCH_ON_DISABLED): 0x06, int(State.READY_TO_SWITCH_ON): 0x07}.get(
         int(state["state"]), 0x0F
     )
+
+
+MEMBER: Final = Dialect(
+    "CAN FD, 29-bit identifiers, no SYNC and no echo",
+    lambda database, truth, eds: InverterFrames(truth=truth),
+)

@@ -12,14 +12,14 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from drivers.bus import Frame
 from drivers.local import EFF_FLAG
 from firmware_model.config import Wire
-from firmware_model.house import Sent
+from firmware_model.dialects import Dialect, Sent, Synchronous
 from firmware_model.inverter import controlword
 from firmware_model.kernels import Kernels
 from firmware_model.plant import ErrorCode, State, Takes
@@ -147,10 +147,10 @@ class Asked:
     reads: tuple[Subframe, ...] = ()
 
 
-class MoteusFrames:
+class MoteusFrames(Synchronous):
     """What this drive reads and writes. ``ignored`` counts frames that it did not take."""
 
-    due: Sequence[Sent] = ()
+    answers_commands = True
     beat_ns = 0
     """It speaks when it is asked, never by itself."""
     counter_modulus = 256
@@ -170,6 +170,10 @@ class MoteusFrames:
         self.sync_id: int | None = EFF_FLAG | ASKS | node_id
         """The command of the first master: it moves a drive in lockstep on."""
         self.ignored: Counter[str] = Counter()
+
+    def asks(self, data: bytes) -> bool:
+        """Any frame to it, whatever is in it."""
+        return True
 
     def boot(self) -> list[Sent]:
         """It sends nothing when it starts."""
@@ -292,3 +296,9 @@ class MoteusFrames:
     @staticmethod
     def _fault(state: Any) -> int:
         return ERRORS.get(int(state["error"]), DRIVER_FAULT) if state["state"] == State.FAULT else 0
+
+
+MEMBER: Final = Dialect(
+    "the register protocol over CAN FD",
+    lambda database, truth, eds: MoteusFrames(database.node.node_id, truth=truth),
+)

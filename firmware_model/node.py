@@ -21,16 +21,11 @@ import numpy as np
 from drivers.bus import Frame, Link, unpack_frame
 from drivers.codec import Database
 from drivers.errors import LinkError
-from firmware_model.cia402 import WIRE as CIA402_WIRE
-from firmware_model.cia402 import Cia402Frames
 from firmware_model.config import Record, Wire, new_sample, new_state
+from firmware_model.dialects import Eds, Frames, Sent, dialect
 from firmware_model.drive import advance
 from firmware_model.faulty_plant import PlantFaults, advance_open_phase
-from firmware_model.house import HouseFrames, Sent
-from firmware_model.inverter import InverterFrames
 from firmware_model.kernels import Kernels
-from firmware_model.moteus import MoteusFrames
-from firmware_model.odrive import ODriveFrames
 from firmware_model.plant import State
 from firmware_model.station import (
     ANSWER,
@@ -44,34 +39,22 @@ from firmware_model.station import (
     station,
 )
 
-Frames = HouseFrames | InverterFrames | Cia402Frames | ODriveFrames | MoteusFrames
-
-Eds = tuple[Path, dict[int, dict[int, bytes]]]
-"""A CANopen node's EDS, and what it has stored."""
 BLACK_BOX = "black box: "
 LOOK_NS = 1_000_000_000
 """So long a busy drive serves the bus without asking whether to stop; a signal asks at once."""
 RUN_OUT_NS = 500_000_000
-Protocol = Literal["house", "inverter", "cia402", "odrive", "moteus"]
 
 
 def frames_of(
-    database: Database, protocol: Protocol = "house", truth: bool = True, eds: Eds | None = None
+    database: Database, protocol: str = "house", truth: bool = True, eds: Eds | None = None
 ) -> Frames:
-    """What a drive of this protocol reads and writes. Raises DatabaseError."""
-    if protocol == "cia402":
-        path, stored = eds or (Path(), {})
-        return Cia402Frames(path, database.node.node_id, stored)
-    if protocol == "odrive":
-        return ODriveFrames(database.node.node_id, truth=truth)
-    if protocol == "moteus":
-        return MoteusFrames(database.node.node_id, truth=truth)
-    return InverterFrames(truth=truth) if protocol == "inverter" else HouseFrames(database, truth=truth)
+    """What a drive of this protocol reads and writes. Raises DatabaseError or PlantError."""
+    return dialect(protocol).frames(database, truth, eds)
 
 
-def wire_of(database: Database, protocol: Protocol = "house") -> Wire:
+def wire_of(database: Database, protocol: str = "house") -> Wire:
     """Resolution and range of the measured signals."""
-    return CIA402_WIRE if protocol == "cia402" else frames_of(database, protocol).wire
+    return dialect(protocol).wire or frames_of(database, protocol).wire
 
 
 def compile_kernels(params: Record, state: Record) -> None:
@@ -94,12 +77,12 @@ class Node:
         pacing: Literal["sync", "cyclic"],
         period_ns: int,
         truth: bool,
-        protocol: Protocol = "house",
+        protocol: str = "house",
         eds: Path | None = None,
         faults: PlantFaults | None = None,
     ) -> None:
         self._link, self._clock, self._period_ns = link, clock, period_ns
-        self._pacing = "sync" if protocol == "odrive" and clock == "lockstep" else pacing
+        self._pacing = "sync" if dialect(protocol).steps and clock == "lockstep" else pacing
         self._make_frames = functools.partial(
             frames_of, database, protocol, truth, (eds, {}) if eds else None
         )
@@ -223,17 +206,16 @@ class Node:
     def take(self, frame: Frame) -> None:
         """Handle one frame, whole or not at all."""
         opens = frame.can_id | frame.flags == self._frames.sync_id
-        asked = isinstance(self._frames, MoteusFrames)
-        if asked or not opens:
+        if self._frames.answers_commands or not opens:
             self._frames.take(frame, self._kernels, self._on_command)
             if due := self._frames.due:
                 self._frames.due = ()
                 self._send(due)
         if opens and self._pacing == "sync":
-            if len(frame.data) > 1 and not asked:  # CANopen: no data or the counter
-                self.ignored["length"] += 1
-            else:
+            if self._frames.asks(frame.data):
                 self.sync(time.monotonic_ns())
+            else:
+                self.ignored["length"] += 1
 
     def sync(self, now_ns: int) -> None:
         """One SYNC (or cycle): advance, latch, sample, answer."""

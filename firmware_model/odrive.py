@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Final
 
 from drivers.bus import Frame
 from drivers.local import EFF_FLAG
 from firmware_model.config import Wire
-from firmware_model.house import Sent
+from firmware_model.dialects import Dialect, Sent, Synchronous
 from firmware_model.inverter import controlword
 from firmware_model.kernels import Kernels
 from firmware_model.plant import ErrorCode, State
@@ -47,10 +47,9 @@ BEAT_EVERY: Final = 10
 TURN: Final = 2.0 * math.pi
 
 
-class ODriveFrames:
+class ODriveFrames(Synchronous):
     """What this drive reads and writes. ``ignored`` counts frames that it did not take."""
 
-    due: Sequence[Sent] = ()
     beat_ns = 100_000_000
     counter_modulus = 256
     wire = Wire(1e-6, 1e5, 1e-6, 1e4, 1e-6, 1e4)
@@ -134,3 +133,10 @@ class ODriveFrames:
         frames.append((self._id(GET_IQ), pack("<ff", 0.0, out["i_q"]), False))
         frames.append((self._id(ESTIMATES), pack("<ff", 0.0, out["w"] / TURN), False))
         return frames
+
+
+MEMBER: Final = Dialect(
+    "CAN Simple",
+    lambda database, truth, eds: ODriveFrames(database.node.node_id, truth=truth),
+    steps=True,
+)

@@ -21,8 +21,10 @@ from drivers.bcm import KernelSync, kernel_sync
 from drivers.binding import Binding, bind
 from drivers.bus import BusSettings, Link, open_link
 from drivers.busload import frame_seconds, message_rates, message_shares
-from drivers.client import DriveClient, OnFrames, precompile
+from drivers.client import precompile
 from drivers.codec import Database
+from drivers.drive import Drive as BusDrive
+from drivers.drive import DriveKind, DriveKindError, OnFrames, drive_kind
 from drivers.errors import DriverError, LinkError
 from drivers.jit import COMPILED
 from drivers.kernel import interface_facts
@@ -197,8 +199,9 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
         loop = config.loop.model_copy(update={"pacing": "sync"})
         config = config.model_copy(update={"loop": loop})
     binding = bind(parts, database, load=load, period_ms=period_ms)
-    _check_pacing(path, config, binding)
-    _check_sync(path, config, binding)
+    kind = _kind(path, config)
+    _check_pacing(path, config, binding, kind)
+    _check_sync(path, config, binding, kind)
     shown = {part: signal.span for part in RECEIVED if (signal := binding.signal(part))}
     wire = wire_facts(binding)
     _check_command(path, config)
@@ -208,6 +211,14 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     if config.drive.takes != "voltage":
         refuse_unstable(str(path), config, machine, wire.x_lsb[0])
     return Setup(path, config, database, binding, wire, machine, out_of_reach(config, wire))
+
+
+def _kind(path: Path, config: RunConfig) -> DriveKind:
+    """What speaks with the drive. Raises ConfigError."""
+    try:
+        return drive_kind(config.drive.kind)
+    except DriveKindError as error:
+        raise ConfigError(str(path), [f"drive.kind: {error}"]) from error
 
 
 def _check_command(path: Path, config: RunConfig) -> None:
@@ -221,8 +232,15 @@ def _check_command(path: Path, config: RunConfig) -> None:
         )
 
 
-def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
-    """A drive that takes no SYNC can't be paced by it. Raises ConfigError."""
+def _check_pacing(path: Path, config: RunConfig, binding: Binding, kind: DriveKind) -> None:
+    """A drive without SYNC is not paced by it, one that is asked by nothing else. Raises ConfigError."""
+    if kind.asked and binding.sync is None:
+        missing = f"drive.signals.sync: missing; name the message that asks a {config.drive.kind} drive"
+        raise ConfigError(str(path), [missing])
+    if kind.asked and config.loop.pacing != "sync":
+        raise ConfigError(
+            str(path), [f'loop.pacing: a {config.drive.kind} drive speaks when it is asked; take "sync"']
+        )
     if binding.map.poll and config.loop.pacing != "sync":
         raise ConfigError(
             str(path), ['loop.pacing: the drive answers each command (drive.signals.poll); take "sync"']
@@ -235,7 +253,7 @@ def _check_pacing(path: Path, config: RunConfig, binding: Binding) -> None:
         )
 
 
-def _check_sync(path: Path, config: RunConfig, binding: Binding) -> None:
+def _check_sync(path: Path, config: RunConfig, binding: Binding, kind: DriveKind) -> None:
     """Where the kernel can send SYNC in the loop's place. Raises ConfigError."""
     loop = config.loop
     if config.bus.sync == "loop":
@@ -246,6 +264,7 @@ def _check_sync(path: Path, config: RunConfig, binding: Binding) -> None:
         'loop.clock = "realtime"': loop.clock == "realtime",
         "a run that sends: no loop.shadow": not loop.shadow,
         "a SYNC of at most one byte": binding.sync is None or binding.sync.length <= 1,
+        "a drive that takes SYNC and is not asked": not kind.asked,
         "compiled kernels: no NUMBA_DISABLE_JIT": COMPILED,
     }
     lacking = [need for need, there in needs.items() if not there]
@@ -400,7 +419,7 @@ def opened_client(
     recorder: Recorder | None,
     clock: RealClock | LockstepClock,
     watch: CommandWatch | None = None,
-) -> Iterator[DriveClient]:
+) -> Iterator[BusDrive]:
     """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
     on_frames = recorder.frames if recorder and setup.config.log.frames else None
     client = _client(setup, watch.chained(on_frames) if watch else on_frames, clock.now_ns, controls=True)
@@ -415,14 +434,14 @@ def _client(
     on_frames: OnFrames | None = None,
     now: Callable[[], int] = time.monotonic_ns,
     controls: bool = False,
-) -> DriveClient:
+) -> BusDrive:
     """A drive client on a link of its own; one that ``controls`` may have SYNC by the kernel."""
     load = setup.config.controller.kind == "fac"
     link: Link = open_link(bus_settings(setup.config))
     if setup.config.loop.clock == "lockstep":
         sync = setup.binding.opener
         link = LockstepLink(link, sync.send_id if sync else None)
-    return DriveClient(
+    return drive_kind(setup.config.drive.kind).open(
         link,
         setup.database,
         load=load,
@@ -518,7 +537,8 @@ def compile_kernels(setup: Setup) -> None:
     """Compile, or load, what a run needs: that takes longer than anything later waits for."""
     setup.machine.looped()
     fac = setup.config.controller.kind == "fac"
-    precompile(setup.database, setup.binding.map, fac, new_ticks()[0])
+    opens = drive_kind(setup.config.drive.kind).open
+    precompile(setup.database, setup.binding.map, fac, new_ticks()[0], opens)
     fused.load(plan_of(setup.config).pacing)
 
 
@@ -566,7 +586,7 @@ def _alone(setup: Setup) -> Iterator[None]:
 def _guarding(setup: Setup, recorder: Recorder) -> Iterator[Words | None]:
     """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own."""
 
-    def client() -> DriveClient:
+    def client() -> BusDrive:
         recorder.leave()
         return _client(setup)
 
@@ -593,10 +613,13 @@ def _recorded(
     watch = CommandWatch(setup.binding) if config.loop.shadow else None
     with opened_client(setup, recorder, clock, watch) as client:
         recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
+        asked = not watch and drive_kind(config.drive.kind).asked
+        if asked:  # who asks has listened
+            _hear_others(setup, client)
         if watch or not setup.binding.map.poll:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
-            _await_drive(setup, client)
-        if not watch:
+            _await_drive(setup, client, asked)
+        if not (watch or asked):
             _hear_others(setup, client)
         recorder.await_open()
         say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
@@ -618,7 +641,7 @@ def _recorded(
 
 
 @contextlib.contextmanager
-def _started(client: DriveClient | None) -> Iterator[None]:
+def _started(client: BusDrive | None) -> Iterator[None]:
     """The drive's CANopen node in operation, where it has one; every way out leaves it. None: a shadow."""
     if client is None:
         yield
@@ -638,24 +661,25 @@ def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
     return ranges(setup.machine, config.controller.kind)
 
 
-def _await_drive(setup: Setup, client: DriveClient) -> None:
-    """Listen for the drive before anything is sent."""
+def _await_drive(setup: Setup, client: BusDrive, ask: bool = False) -> None:
+    """Listen for the drive before anything is sent; ``ask``: for what it measures, which commands nothing."""
     timeout_s = setup.config.drive.heartbeat_timeout_s
-    if not client.wait_for_drive(timeout_s):
+    if not client.wait_for_drive(timeout_s, ask):
         bus = setup.config.bus
         hint = (
             f"start it: hil emulate {setup.path}"
             if is_emulated_bus(setup.config)
             else "is it powered and wired?"
         )
+        sent = "no command" if ask else "nothing"
         raise ArmingError(
-            f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, nothing was sent; {hint}"
+            f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, {sent} was sent; {hint}"
         )
     if odd := client.odd_length():
         raise ArmingError(f"{odd}; correct the DBC, or the drive's mapping; nothing was sent")
 
 
-def _hear_others(setup: Setup, client: DriveClient) -> None:
+def _hear_others(setup: Setup, client: BusDrive) -> None:
     """Listen for another controller, on this machine or not, before anything is sent. Raises ArmingError."""
     heard = client.other_master(max(LISTEN_PERIODS * setup.config.loop.period_ns * 1e-9, LISTEN_S))
     if heard is not None:
@@ -684,7 +708,7 @@ def _run_armed(
     clock: RealClock | LockstepClock,
     request: StopRequest,
     takes: dict[str, tuple[float, float, float]],
-    client: DriveClient,
+    client: BusDrive,
 ) -> RunResult:
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0

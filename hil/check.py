@@ -13,6 +13,7 @@ from rich.text import Text
 
 from drivers.binding import Binding
 from drivers.bus import open_link
+from drivers.drive import drive_kind
 from drivers.errors import DriverError, LinkError
 from drivers.kernel import InterfaceFacts, interface_facts
 from drivers.listen import Heard, Traffic, listen, part_values
@@ -37,6 +38,7 @@ FAULTS = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
 MOST_MS = 3.0
 """Peak of the sensitivity in the worst corner without a warning: a phase margin of 19 deg at least."""
+UNASKED = "it speaks when it is asked: hil run asks it before arming, and enables no drive in FAULT"
 SILENT = "a drive that only answers SYNC or commands can't show it before arming; nothing to do"
 
 
@@ -246,15 +248,16 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
     config = setup.config
     silent_ok = config.loop.pacing == "sync"
     values = part_values(setup.binding, traffic)
+    asked = drive_kind(config.drive.kind).asked
     return [
-        drive_row(traffic, setup.binding, config.drive.heartbeat_timeout_s),
+        drive_row(traffic, setup.binding, config.drive.heartbeat_timeout_s, asked),
         *feedback_rows(setup, traffic, silent_ok),
         frames_row(traffic),
         *length_rows(traffic, setup.binding),
         *started_rows(setup.binding),
         *unwatched_rows(setup.binding),
         others_row(traffic, setup.binding),
-        state_row(traffic, setup.binding, values),
+        state_row(traffic, setup.binding, values, asked),
         *version_rows(setup, traffic, silent_ok),
         motion_row(values, config.limits, silent_ok),
         *supply_rows(setup.binding, values, config.limits, silent_ok),
@@ -271,16 +274,16 @@ def feedback_rows(setup: Setup, traffic: Traffic, silent_ok: bool) -> list[Row]:
     return [replace(r, check=f"{r.check} {name}") for name, r in zip(names, rows, strict=True)]
 
 
-def drive_row(traffic: Traffic, binding: Binding, seconds: float) -> Row:
-    """Is there a drive at all."""
+def drive_row(traffic: Traffic, binding: Binding, seconds: float, asked: bool = False) -> Row:
+    """Is there a drive at all; one that speaks when it is asked can't tell."""
     messages = [binding.heartbeat, *(bound.message for bound in binding.incoming)]
     names = [message.name for message in messages if message and traffic.of(message.name).count]
     remedy = "is it powered, wired and terminated; are node id and bitrate right?"
     if traffic.down:
         return Row("drive", "fail", "the bus went down while listening", remedy)
     found = f"heard {', '.join(names) or 'nothing'} in {seconds:g} s, {traffic.foreign} frames not in the DBC"
-    if binding.map.poll and not names:
-        return Row("drive", "warn", found, SILENT)
+    if not names and (asked or binding.map.poll):
+        return Row("drive", "warn", found, UNASKED if asked else SILENT)
     return row("drive", bool(names), found, remedy)
 
 
@@ -342,7 +345,7 @@ def others_row(traffic: Traffic, binding: Binding) -> Row:
     return row("other controller", not names, found, remedy, "warn")
 
 
-def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> Row:
+def state_row(traffic: Traffic, binding: Binding, values: dict[str, float], asked: bool = False) -> Row:
     """State of the drive, from feedback or else from its heartbeat."""
     remedy = "clear the drive's fault and its cause first"
     if "state" in values:
@@ -356,6 +359,8 @@ def state_row(traffic: Traffic, binding: Binding, values: dict[str, float]) -> R
     beat = _nmt_state(traffic, binding)
     if beat is None and binding.map.poll:
         return Row("drive state", "warn", "unknown: it answers when it is asked, after arming", SILENT)
+    if beat is None and asked:
+        return Row("drive state", "warn", "unknown before it is asked", UNASKED)
     if beat is None:
         return Row("drive state", "fail", "unknown: nothing heard that tells it", "see the row drive")
     nmt = f"{NMT_STATES.get(int(beat), f'unknown ({beat:g})')} by its heartbeat"

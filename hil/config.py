@@ -312,6 +312,8 @@ class DriveTable(Table):
 
     dbc: str
     """Path of the drive's DBC file, relative to this file."""
+    kind: str = "dbc"
+    """How frames are exchanged: dbc, by SYNC or the drive's clock; or a package's entry point hil.drive."""
     node_id: Annotated[int, Field(ge=0, le=255)] = 1
     """Number of the drive on the bus; it moves the identifiers of the DBC as node_rule says."""
     node_rule: str = ""

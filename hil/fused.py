@@ -18,7 +18,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from drivers.client import FLUSH_AT, DriveClient
+from drivers.client import FLUSH_AT
+from drivers.drive import Drive
 from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
 from drivers.posix import (
     COMMANDED,
@@ -93,7 +94,7 @@ PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS = range(5)
 
 
 def whole_tick(
-    client: DriveClient,
+    client: Drive,
     words: Words | None,
     machine: Machine,
     recorder: Recorder,

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.binding import Binding
 from drivers.bus import Frame
-from drivers.client import DriveClient
+from drivers.drive import drive_kind
 from drivers.mapping import MEASURED
 from drivers.port import Saved
 from drivers.watch import CommandWatch
@@ -108,7 +108,7 @@ class Run:
         config = setup.config
         self.shadow, self.roles = config.loop.shadow, roles_of(setup.binding)
         load = config.controller.kind == "fac"
-        self._client = DriveClient(
+        self._client = drive_kind(config.drive.kind).open(
             self.tape, setup.database, load=load, drive_map=setup.binding.map, now=lambda: 0
         )
         self._watch = CommandWatch(setup.binding) if self.shadow else None

@@ -126,14 +126,14 @@ def _members(schema: Schema, given: Schema) -> tuple[list[Schema], bool]:
 
 def _key(name: str, given: Schema, required: bool, table: Table) -> Key:
     before = table.key + ("" if not table.key or table.key.endswith(":") else ".")
-    if name == "kind":
+    if name == "kind" and table.kind:
         doc = "Tells the kinds apart" + ("." if required else "; this one may be left out.")
         given = {"default": table.kind, "description": doc}
     least, above, most = _bounds(given.get("items", given) if given.get("type") == "array" else given)
     return Key(
         key=before + name,
         kind=table.kind,
-        type=f'"{table.kind}"' if name == "kind" else _type(given),
+        type=f'"{table.kind}"' if name == "kind" and table.kind else _type(given),
         unit=given.get("x-unit"),
         least=least,
         above=above,

@@ -100,7 +100,8 @@ def _describe(table: Schema, model: type[BaseModel]) -> None:
         key |= {"description": sentence(text), **({"x-unit": unit} if unit and _counts(key) else {})}
         if any(getattr(one, "func", None) in INCLUDED for one in field.metadata):
             table["properties"][name] = {"anyOf": [{"type": "string"}, key], "description": sentence(text)}
-    if table["properties"].get("kind", {}).get("default") not in (None, *USUAL):
+    kind = table["properties"].get("kind", {})
+    if "const" in kind and kind.get("default") not in (None, *USUAL):  # else a key of that name
         table["required"] = sorted({*table.get("required", ()), "kind"})
     table["description"] = sentence((model.__doc__ or "").split("\n\n")[0])
 
