@@ -137,7 +137,8 @@ class Shown:
     ``plot``: key of a report's plot; a key that is not in :mod:`hil.report.curves` is a plot of its own.
     ``label``: what legends call it; ``place``: its order there. ``compared``: drawn where several runs are.
     ``until_stop``: means nothing once the run stops. ``live``: its plot in ``hil watch --web``.
-    ``what_if``: compared between the logged and another controller.
+    ``what_if``: compared between the logged and another controller. ``line``: what its line of ``hil watch``
+    in the terminal is called; ``span``: the smallest range that fills its height, in the drawn unit.
     """
 
     plot: str = ""
@@ -147,6 +148,8 @@ class Shown:
     until_stop: bool = False
     live: str = ""
     what_if: bool = False
+    line: str = ""
+    span: float = 1.0
 
 
 HIDDEN: Final = Shown()
@@ -181,7 +184,7 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(1, "k", "u8", "", "time", "tick index"),
     Field(2, "t_ns", "i8", "ns", "time", "deadline of the tick on the loop's clock"),
     Field(3, "lateness_ns", "i4", "ns", "time", "wake-up after the deadline",
-          shown=Shown("lateness", "woken", 3, until_stop=True, live="lateness")),
+          shown=Shown("lateness", "woken", 3, until_stop=True, live="lateness", line="lateness", span=10.0)),
     Field(4, "received_ns", "i4", "ns", "time",
           "newest feedback taken, after the deadline; paced by the timer it may be negative: its age",
           shown=Shown("lateness", "received", 2, False, True)),
@@ -197,11 +200,11 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(16, "rx_flags", "u4", "", "input", "RxFlag bits"),
     Field(17, "gap", "u4", "", "input", "periods since the previous tick (1 unless periods were skipped)"),
     Field(18, "w", "f8", "rad/s", "input", "measured mechanical speed",
-          shown=Shown("speed", "w", 1, live="speed")),
+          shown=Shown("speed", "w", 1, live="speed", line="speed")),
     Field(19, "i_q", "f8", "A", "input", "measured q current",
-          shown=Shown("current", "i_q", 1, live="current")),
+          shown=Shown("current", "i_q", 1, live="current", line="current q", span=0.2)),
     Field(20, "i_d", "f8", "A", "input", "measured d current",
-          shown=Shown("current", "i_d", 2, False, live="current")),
+          shown=Shown("current", "i_d", 2, False, live="current", line="current d", span=0.2)),
     Field(21, "echo", "u4", "", "input", "counter of the command the drive applies from now on"),
     Field(22, "drive_state", "u4", "", "input", "DriveState of the drive",
           shown=Shown("state", "drive", 1, False)),
@@ -213,7 +216,8 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(26, "temperature_inverter", "f8", "degC", "input", "inverter temperature, newest status frame",
           shown=Shown("temperature", "inverter", 1, False)),
     Field(27, "drive_error", "u4", "", "input", "CiA 301/402 error code of the drive, 0 for none"),
-    Field(28, "w_ref", "f8", "rad/s", "input", "reference speed", shown=Shown("speed", "w*", live="speed")),
+    Field(28, "w_ref", "f8", "rad/s", "input", "reference speed",
+          shown=Shown("speed", "w*", live="speed", line="reference")),
     Field(29, "dw_ref", "f8", "rad/s2", "input", "its derivative"),
     Field(30, "request", "u4", "", "input", "Request of the operator"),
     Field(31, "log_failed", "u4", "", "input", "1 when the writer reported a failure"),
@@ -260,7 +264,8 @@ FIELDS: Final[tuple[Field, ...]] = (
           shown=Shown("voltage_d", "sent", 1, False, live="command")),
     Field(66, "T_L", "f8", "N m", "output", "load torque sent (fac), else 0"),
     Field(67, "T_L_hat", "f8", "N m", "output", "load torque estimate -J d_hat_w",
-          shown=Shown("load", "estimate", 1, until_stop=True, live="load torque", what_if=True)),
+          shown=Shown("load", "estimate", 1, until_stop=True, live="load torque", what_if=True,
+                      line="load estimate", span=0.2)),
 )  # fmt: skip
 
 

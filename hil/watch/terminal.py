@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import select
 import sys
+from collections.abc import Sequence
+from itertools import cycle
 from typing import Final
 
 import numpy as np
@@ -17,22 +19,15 @@ from rich.text import Text
 
 from hil.arming import keys_at_once
 from hil.errors import plain
-from hil.signals import TickArray
+from hil.signals import FIELDS, Field, TickArray
+from hil.watch.feed import LIVE
 from hil.watch.look import Event, Look, figures, outcome
 from hil.watch.registry import Entry
 
 REFRESH_S: Final = 0.25
 SHOWN_S: Final = 3.5  # the ring holds 4 s
 BLOCKS: Final = "▁▂▃▄▅▆▇█"
-ROWS: Final = (
-    ("speed", "w", "rad/s", "cyan", 1.0),
-    ("reference", "w_ref", "rad/s", "blue", 1.0),
-    ("current q", "i_q", "A", "yellow", 0.2),
-    ("current d", "i_d", "A", "magenta", 0.2),
-    ("load estimate", "T_L_hat", "N m", "green", 0.2),
-    ("lateness", "lateness_ns", "us", "red", 10.0),
-)
-"""Label, field, unit, colour, and the smallest span that fills the height."""
+COLOURS: Final = ("cyan", "blue", "yellow", "magenta", "green", "red")
 STATE_STYLES: Final = {
     "operation_enabled": "bold green",
     "fault": "bold red",
@@ -54,17 +49,24 @@ def sparkline(values: npt.NDArray[np.float64], width: int, least_span: float) ->
     return "".join(BLOCKS[round(min(max((value - low) / span, 0.0), 1.0) * top)] for value in drawn)
 
 
-def curves(ticks: TickArray, width: int) -> Table:
+def lines(fields: Sequence[Field] = FIELDS) -> list[Field]:
+    """The fields that have a line, by the plots of the live page."""
+    order = dict(zip(LIVE, range(len(LIVE)), strict=True))
+    return sorted((f for f in fields if f.shown.line), key=lambda f: order.get(f.shown.live, len(LIVE)))
+
+
+def curves(ticks: TickArray, width: int, fields: Sequence[Field] = FIELDS) -> Table:
     """One row a signal: newest value, sparkline, smallest and largest."""
     table = Table.grid(padding=(0, 1))
     for justify in ("left", "right", "left", "left", "right"):
         table.add_column(justify=justify, no_wrap=True)
-    for label, name, unit, colour, least in ROWS:
-        values = ticks[name].astype(np.float64) * (1e-3 if unit == "us" else 1.0)
+    for field, colour in zip(lines(fields), cycle(COLOURS)):
+        values = ticks[field.name].astype(np.float64) * field.scale
         if len(values):
-            line = Text(sparkline(values, max(10, width - 56), least), style=colour)
-            ends = f"{values.min():z.2f} .. {values.max():z.2f}"
-            table.add_row(label, f"{values[-1]:z.2f}", Text(unit, style="dim"), line, Text(ends, style="dim"))
+            line = Text(sparkline(values, max(10, width - 56), field.shown.span), style=colour)
+            ends = Text(f"{values.min():z.2f} .. {values.max():z.2f}", style="dim")
+            unit = Text(field.drawn_unit, style="dim")
+            table.add_row(field.shown.line, f"{values[-1]:z.2f}", unit, line, ends)
     return table
 
 

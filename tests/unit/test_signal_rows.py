@@ -11,6 +11,7 @@ import pytest
 from hil.report.curves import CURVES, HEADS, PLOTS, plots_by_field
 from hil.signals import FIELDS, Field, Shown, new_ticks
 from hil.watch.feed import binned, live_plots
+from hil.watch.terminal import curves, lines
 from hil.whatif import COMPARED
 
 SHOWN = [field for field in FIELDS if field.shown.plot]
@@ -63,3 +64,19 @@ def test_the_live_page_has_every_live_field() -> None:
 def test_what_if_compares_estimates_and_what_the_law_asks_for() -> None:
     assert set(COMPARED) == {"d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "i_q_ref", "u_q_law", "u_d_law"}
     assert all(field.role == "output" for field in FIELDS if field.shown.what_if)
+
+
+def test_the_terminal_has_every_field_with_a_line_and_a_new_one() -> None:
+    assert [(field.shown.line, field.name, field.drawn_unit, field.shown.span) for field in lines()] == [
+        ("speed", "w", "rad/s", 1.0), ("reference", "w_ref", "rad/s", 1.0),
+        ("current q", "i_q", "A", 0.2), ("current d", "i_d", "A", 0.2),
+        ("load estimate", "T_L_hat", "N m", 0.2), ("lateness", "lateness_ns", "us", 10.0),
+    ]  # fmt: skip
+    ticks = new_ticks(20)
+    ticks["v_dc"], ticks["lateness_ns"] = np.arange(20), 3000
+    supply = dataclasses.replace(
+        next(field for field in FIELDS if field.name == "v_dc"), shown=Shown(line="supply")
+    )
+    table = curves(ticks, 100, [*FIELDS, supply])
+    labels, newest, units = ([str(cell) for cell in column.cells] for column in table.columns[:3])
+    assert labels[-1] == "supply" and newest[-2:] == ["3.00", "19.00"] and units[-2:] == ["us", "V"]
