@@ -214,6 +214,24 @@ def test_windows_shorter_than_a_doubtful_stand_are_passed_over() -> None:
     assert s["length"][0] == FIRST and s["hold"][0] == FIRST
 
 
+@pytest.mark.parametrize(("share", "found"), [(0.99, 0), (1.01, 1)])
+def test_the_bound_is_that_of_both_estimates(share: float, found: int) -> None:
+    p, s = law(), new_law_state()[0]
+    s["length"][:], s["head"] = N, 100
+    s["past"][100, 0, 0] = share * (p["g"][0, 0] + p["g"][N - 1, 0])
+    assert changed(p, s, 0, 0) == found
+    s["past"][100, 0, 0] *= -1.0
+    assert changed(p, s, 0, 0) == found
+
+
+def test_windows_up_to_half_the_present_one_are_compared() -> None:
+    p, s = law(), new_law_state()[0]
+    s["head"], s["past"][100, 0, 0] = 100, 5000.0
+    for length, least, found in ((1, 0, 0), (2, 0, 1), (3, 1, 0), (4, 1, 2), (31, 8, 0), (32, 8, 16)):
+        s["length"][:] = length
+        assert changed(p, s, 0, least) == found
+
+
 def test_the_first_length_is_for_a_full_window_alone() -> None:
     p, s = law(), new_law_state()[0]
     s["head"], s["x"][:] = 100, 1.0
