@@ -44,8 +44,11 @@ BLOCK: Final = 1024
 
 
 @jit
-def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int) -> None:
-    """SYNC to the drive, its answer into the tick's inputs, as codec and client do it."""
+def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int, messages: int) -> None:
+    """SYNC to the drive, its answer into the tick's inputs, as codec and client do it.
+
+    ``messages``: slow ones that the map reads; they come together.
+    """
     o = out[0]
     on_sync(pp[0], ps[0], o)
     t["w"] = o["w"]
@@ -59,7 +62,7 @@ def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int) -> None:
         t["drive_error"] = o["error"]
     if o["status_due"]:
         t["rx_flags"] |= RxFlag.STATUS.value
-        t["missing"] = ALL_MISSING - 1  # STATUS is the only slow message, if there is one
+        t["missing"] = ALL_MISSING & (ALL_MISSING << messages)
         t["v_dc"], t["drive_error"] = o["v_dc"], o["error"]
         t["temperature_motor"], t["temperature_inverter"] = o["temperature_motor"], o["temperature_inverter"]
 
@@ -108,7 +111,7 @@ def simulate_block(
         t["t_ns"] = (k + j) * period_ns
         t["gap"] = 1
         t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
-        receive(pp, ps, out, t, sp[0]["absent"])
+        receive(pp, ps, out, t, sp[0]["absent"], sp[0]["messages"])
         prepare(rp, gp, gs, ss, lp, tick)
         step(sp, ss, lp, ls, tick)
         deliver(lp, ps, t)
