@@ -109,7 +109,7 @@ def test_a_conventional_dob_runs_through_the_same_loop() -> None:
     "name", ["odrive.toml", "moteus.toml", "cia402.toml", "current.toml", "inverter.toml"]
 )
 def test_a_drive_of_several_slow_messages_runs_to_its_end(name: str) -> None:
-    setup = load_setup(CONFIGS / f"{name}.toml", Overrides(settings=("loop.duration_s=1.0",)))
+    setup = load_setup(CONFIGS / name, Overrides(settings=("loop.duration_s=1.0",)))
     ticks = simulate_ticks(setup)
     assert Reason(int(ticks["reason"][-1])) == Reason.STOP_REQUESTED
     came = ticks["missing"][ticks["missing"] != 2**32 - 1]
