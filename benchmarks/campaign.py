@@ -1,6 +1,6 @@
 """What a case of a campaign costs, beside a case as it was simulated before, and how workers add up.
 
-    python -m benchmarks.campaign [--json] [--cases N] [--full] [--motulator PYTHON]
+    python -m benchmarks.campaign [--json] [--cases N] [--full] [--base PYTHON] [--motulator PYTHON]
 
 Processor time and ratios of one run, so that other load on the machine matters little:
 
@@ -9,6 +9,9 @@ Processor time and ratios of one run, so that other load on the machine matters 
 * the same with the controller varied, which is designed for each case;
 * one worker and two over N cases: wall time, processor time of all, and peak memory of a worker;
 * `--full`: 10,000 and 100,000 cases on two workers;
+* `--base`: a tick of the compiled simulation here and in another version, whose interpreter is given, by
+  turns over that version's demo: `git worktree add ../base REVISION`, a virtual environment in it and
+  `pip install -e .`;
 * motulator's own loop over the same motor at the same control rate. It integrates the motor with scipy's
   adaptive RK45 between control steps and keeps each step; we advance a Taylor series of order 8 twice a tick,
   through the wire's resolution, guard and supervisor, and keep figures. Neither does all that the other does.
@@ -43,7 +46,7 @@ from hil.shipped import find_config
 from hil.simulate import simulate_ticks
 from hil.view import key_values, show
 
-REPEATS, CASE_S = 40, 6.0
+REPEATS, TURNS, CASE_S = 40, 3, 6.0
 PLANT = """[random]
 "plant:motor.J_kg_m2" = { percent = 20 }
 "plant:motor.R_s_ohm" = { percent = 20 }
@@ -149,7 +152,22 @@ def beside_motulator(python: str, case_ms: float) -> dict[str, Any]:
     return found
 
 
-def measure(cases: int, full: bool, python: str) -> dict[str, Any]:
+def beside_base(base: str) -> dict[str, Any]:
+    """Time of a tick [us] of this version and of the one of interpreter ``base``, over the latter's demo."""
+    script, best = str(HERE / "simulated_tick.py"), {base: float("inf"), sys.executable: float("inf")}
+    config: tuple[str, ...] = ()
+    for _ in range(TURNS):
+        for python in best:
+            found = peer(python, script, *config)
+            if "missing" in found:
+                return found
+            config = (found["config"],)
+            best[python] = min(best[python], found["us_a_tick"])
+    there, here = best[base], best[sys.executable]
+    return {"there_us_a_tick": there, "here_us_a_tick": here, "times_as_fast": there / here}
+
+
+def measure(cases: int, full: bool, base: str | None, python: str) -> dict[str, Any]:
     """Everything, by name."""
     with tempfile.TemporaryDirectory(prefix="hil-bench-") as name:
         folder = Path(name)
@@ -160,6 +178,7 @@ def measure(cases: int, full: bool, python: str) -> dict[str, Any]:
     one, two = (found[f"{cases} cases, workers {n}"]["wall_s"] for n in (1, 2))
     return found | {
         "one worker over two": one / two,
+        **({"simulation beside the other version's": beside_base(base)} if base else {}),
         "motulator": beside_motulator(python, found["a case"]["case_ms"]),
     }
 
@@ -170,11 +189,12 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--cases", type=int, default=4000)
     parser.add_argument("--full", action="store_true")
+    parser.add_argument("--base", metavar="PYTHON", help="an interpreter that has another version")
     parser.add_argument(
         "--motulator", default=sys.executable, metavar="PYTHON", help="an interpreter that has motulator"
     )
     args = parser.parse_args()
-    found = measure(args.cases, args.full, args.motulator) | {"machine": machine_facts()}
+    found = measure(args.cases, args.full, args.base, args.motulator) | {"machine": machine_facts()}
     if args.json:
         sys.stdout.write(json.dumps(found, indent=2) + "\n")
         return

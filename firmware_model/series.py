@@ -1,4 +1,7 @@
-"""Truncated power series as arrays of coefficients: product and value."""
+"""Truncated power series as arrays or tuples of coefficients: product and value.
+
+A sum begins with its first term and not with 0: the same but for the sign of a zero, and an addition sooner.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,17 @@ ORDER: Final = 8
 @jit
 def product(a: Any, b: Any, k: int) -> float:
     """Coefficient k of a b: sum_j a_j b_{k-j}."""
-    total = 0.0
-    for j in range(k + 1):
+    total = a[0] * b[k]
+    for j in range(1, k + 1):
         total += a[j] * b[k - j]
-    return total
+    return float(total)
 
 
 @jit
 def products(a: Any, b: Any, c: Any, k: int) -> tuple[float, float, float]:
     """Coefficients k of a b, a c and b c, in one pass."""
-    ab, ac, bc = 0.0, 0.0, 0.0
-    for j in range(k + 1):
+    ab, ac, bc = a[0] * b[k], a[0] * c[k], b[0] * c[k]
+    for j in range(1, k + 1):
         ab += a[j] * b[k - j]
         ac += a[j] * c[k - j]
         bc += b[j] * c[k - j]

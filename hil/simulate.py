@@ -102,22 +102,29 @@ def simulate_block(
     period_ns: int,
     stop_at: int,
 ) -> int:
-    """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended."""
-    t = tick[0]
+    """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended.
+
+    ``tick`` is the one before the first: what a tick does not write it has from the one before.
+    """
+    before = tick
     for j in range(ticks.shape[0]):
         if k + j > 0:
             advance(pp[0], ps[0], period_ns)
+        ticks[j] = before[0]  # now, and not right after they were written: a copy would wait for the writes
+        now = ticks[j : j + 1]
+        t = now[0]
         t["k"] = k + j
         t["t_ns"] = (k + j) * period_ns
         t["gap"] = 1
         t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
         receive(pp, ps, out, t, sp[0]["absent"], sp[0]["messages"])
-        prepare(rp, gp, gs, ss, lp, tick)
-        step(sp, ss, lp, ls, tick)
+        prepare(rp, gp, gs, ss, lp, now)
+        step(sp, ss, lp, ls, now)
         deliver(lp, ps, t)
-        ticks[j] = tick[0]
+        before = now
         if ended(t):
             return j + 1
+    tick[0] = before[0]
     return int(ticks.shape[0])
 
 

@@ -49,6 +49,13 @@ def test_the_estimate_is_within_what_the_frames_resolve() -> None:
     assert 0 < step.estimate_error <= bound
 
 
+def test_the_length_of_a_block_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = simulated((), "loop.duration_s=0.5")
+    monkeypatch.setattr("hil.simulate.BLOCK", 7)
+    parts = simulate_ticks(load_setup(PATH, Overrides(settings=("loop.duration_s=0.5",))), [])
+    assert len(whole) > 500 and parts.tobytes() == whole.tobytes()
+
+
 def test_the_matched_loop_dips_and_recovers() -> None:
     ticks = simulated((), MATCHED)
     own = operating(ticks)

@@ -122,6 +122,16 @@ def test_a_step_of_the_load_inside_a_substep_is_met_to_the_nanosecond() -> None:
     assert s["x"][0, 0] != pytest.approx(-5.0 * 0.0006 / 0.011, rel=1e-2)
 
 
+@pytest.mark.parametrize("on", [True, False])
+def test_the_plain_series_is_the_series_to_the_bit(on: bool) -> None:
+    p, s = plant(disturbance={"phi_w_rad_s2": 3.0, "phi_q_a_s": 2.0})
+    for x in ([100.0, 5.0, -2.0], [-30.0, -9.0, 4.0], [0.0, 0.0, 0.0]):
+        s["x"][0] = x
+        motor.series(p[0], s["x"][0], s["series"][0], 0.0, 5e-4, 60.0, -20.0, 1.5, on)
+        plain = motor.plain_series(p[0], s["x"][0], 1.5, 60.0, -20.0, on)
+        assert np.array_equal(np.array(plain), s["series"][0, :3]), x
+
+
 def slope(**changed: float) -> np.ndarray:
     """dx/dt at standstill, from the first coefficients of the series."""
     p, s = plant()
@@ -194,6 +204,14 @@ def test_noise_is_normal_white_and_its_own_for_each_seed(seed: int) -> None:
         assert abs(np.mean(x[lag:] * x[:-lag])) < 5 / math.sqrt(20_000), (seed, lag)
     assert abs(np.mean(x * other)) < 5 / math.sqrt(20_000), seed
     assert abs(np.mean(np.abs(x) < 1) - 0.6827) < 0.02 and np.abs(x).max() <= 6
+
+
+@pytest.mark.parametrize("seed", [0, 1, 20261124, 2**31 - 1])
+def test_a_normal_number_is_the_sum_of_twelve_uniform_ones_to_the_bit(seed: int) -> None:
+    at_once, one_by_one = new_state(plant(seed=seed)[0], 15)[0], new_state(plant(seed=seed)[0], 15)[0]
+    for _ in range(200):
+        expected = sum(sensors.uniform(one_by_one) for _ in range(12)) - 6.0
+        assert (sensors.normal(at_once), at_once["random"]) == (expected, one_by_one["random"]), seed
 
 
 def test_uniform_bits_are_fair_and_the_period_is_long() -> None:

@@ -1,0 +1,40 @@
+"""Peer: time of a tick of the compiled simulation in this interpreter's hil-drive. Prints one JSON line.
+
+    PYTHON benchmarks/simulated_tick.py [CONFIG]
+
+CONFIG: the demo of that hil-drive. The fastest of many runs of six seconds, in time of the processor. It is
+standalone and asks for no more than versions before campaigns have, so that two versions can be compared.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+SECONDS, REPEATS = 6.0, 60
+
+
+def main() -> None:
+    """Simulate and say how long a tick took."""
+    os.environ.pop("NUMBA_CACHE_DIR", None)  # each version keeps its kernels in its own tree
+    import hil
+    from hil.app import Overrides, load_setup
+    from hil.simulate import make_simulation
+
+    demo = Path(hil.__file__).resolve().parents[1] / "configs" / "demo.toml"
+    config = Path(sys.argv[1]) if len(sys.argv) > 1 else demo
+    setup = load_setup(config, Overrides(settings=(f"loop.duration_s={SECONDS}",)))
+    best, ticks = float("inf"), 0
+    for _ in range(REPEATS + 1):
+        blocks = make_simulation(setup, []).blocks()
+        begin = time.process_time()
+        ticks = sum(len(block) for block in blocks)
+        best = min(best, time.process_time() - begin)
+    sys.stdout.write(json.dumps({"config": str(config), "us_a_tick": 1e6 * best / ticks}) + "\n")
+
+
+if __name__ == "__main__":
+    main()
