@@ -168,6 +168,7 @@ def test_the_bound_on_false_alarms() -> None:
     assert threshold(60, T_S / 4, 0.01) > threshold(60, T_S, 0.01)
 
 
+@pytest.mark.compiled
 def test_no_false_alarm_in_five_minutes_of_noise_and_rounding() -> None:
     rng = np.random.default_rng(5)
     x = rng.normal(size=(300_000, 3)) * [0.01, 0.002, 0.002]

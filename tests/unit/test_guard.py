@@ -212,6 +212,10 @@ def test_a_step_of_the_wire_in_the_circle_is_sent_as_it_is(asked: tuple[float, f
     assert [inward(u, 0.01) for u in asked] == list(asked)
 
 
+def test_less_than_a_step_of_the_wire_is_zero_without_a_sign() -> None:
+    assert [math.copysign(1.0, inward(u, 0.01)) for u in (0.009, -0.009)] == [1.0, 1.0]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_a_limited_step_stays_in_the_circle(seed: int) -> None:
     """Both axes limited by themselves reached 311 V of 300: from (212, 212) towards (300, 0)."""

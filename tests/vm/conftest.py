@@ -64,7 +64,7 @@ def socketcan(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if host_has_can():
             printed = run_natively(out)
         else:
-            result = run_in_machine(["python", "tests/vm/guest/suite.py"], timeout_s=1500.0, out=out)
+            result = run_in_machine(["python", "tests/vm/guest/suite.py"], timeout_s=2400.0, out=out)
             printed = result.stdout + result.stderr
     except (MachineError, OSError) as error:
         if REQUIRED:
