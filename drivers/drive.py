@@ -12,10 +12,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
 from drivers.errors import DriverError
+from drivers.plugins import loaded_as, names
 
 if TYPE_CHECKING:
     from drivers.bcm import KernelSync
@@ -143,7 +144,7 @@ BUILT_IN: Final = {USUAL: "drivers.client"}
 
 def kinds() -> tuple[str, ...]:
     """What ``drive.kind`` may be."""
-    return (*BUILT_IN, *sorted({entry.name for entry in entry_points(group=GROUP)} - set(BUILT_IN)))
+    return names(GROUP, BUILT_IN)
 
 
 def drive_kind(name: str) -> DriveKind:
@@ -160,15 +161,4 @@ def drive_kind(name: str) -> DriveKind:
     if len(named) > 1:
         where = " and ".join(sorted(entry.value for entry in named))
         raise DriveKindError(f"{name!r} is named by {where}; uninstall one")
-    return _loaded(named[0])
-
-
-def _loaded(entry: EntryPoint) -> DriveKind:
-    """What an entry point names; what its package raises is said with its name."""
-    try:
-        kind = entry.load()
-    except Exception as error:
-        raise DriveKindError(f"{entry.name} = {entry.value}: {type(error).__name__}: {error}") from error
-    if not isinstance(kind, DriveKind):
-        raise DriveKindError(f"{entry.name} = {entry.value} is no drivers.drive.DriveKind")
-    return kind
+    return loaded_as(named[0], DriveKind, DriveKindError)

@@ -10,10 +10,11 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
+from drivers.plugins import loaded_as, names
 from firmware_model.registry import PlantError
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class Dialect:
 
 def dialects() -> tuple[str, ...]:
     """What ``protocol`` may be."""
-    return (*BUILT_IN, *sorted({entry.name for entry in entry_points(group=GROUP)} - set(BUILT_IN)))
+    return names(GROUP, BUILT_IN)
 
 
 def dialect(name: str) -> Dialect:
@@ -120,15 +121,4 @@ def dialect(name: str) -> Dialect:
     if len(named) != 1:
         where = " and ".join(sorted(entry.value for entry in named)) or "no package"
         raise PlantError(f"{GROUP}: {name!r} is named by {where}; one must be installed")
-    return _loaded(named[0])
-
-
-def _loaded(entry: EntryPoint) -> Dialect:
-    """What an entry point names; what its package raises is said with its name."""
-    try:
-        member = entry.load()
-    except Exception as error:
-        raise PlantError(f"{GROUP}: {entry.name} = {entry.value}: {type(error).__name__}: {error}") from error
-    if not isinstance(member, Dialect):
-        raise PlantError(f"{GROUP}: {entry.name} = {entry.value} is no firmware_model.dialects.Dialect")
-    return member
+    return loaded_as(named[0], Dialect, lambda why: PlantError(f"{GROUP}: {why}"))

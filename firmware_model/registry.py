@@ -21,6 +21,7 @@ import numpy as np
 
 from drivers.errors import DriverError
 from drivers.kernelcache import rests_on
+from drivers.plugins import loaded
 from firmware_model.tables import Table
 
 GROUP: Final = "hil.loads"
@@ -78,18 +79,10 @@ def loads() -> dict[str, Load]:
     modules = [f"firmware_model.loads.{name}" for name in names]
     found = [(name, importlib.import_module(name).MEMBER) for name in modules]
     for entry in entry_points(group=GROUP):
-        found.append((entry.value, _loaded(entry)))
+        found.append((entry.value, loaded(entry, lambda why: PlantError(f"{GROUP}: {why}"))))
         modules.append(entry.module)
     rests_on(__file__, [Path(str(sys.modules[module].__file__)) for module in modules])
     return _checked(found)
-
-
-def _loaded(entry: Any) -> Any:
-    """What an entry point names; what its package raises is said with its name."""
-    try:
-        return entry.load()
-    except Exception as error:
-        raise PlantError(f"{GROUP}: {entry.name} = {entry.value}: {type(error).__name__}: {error}") from error
 
 
 def _checked(found: Iterable[tuple[str, Any]]) -> dict[str, Load]:

@@ -32,13 +32,12 @@ from firmware_model.plant import ErrorCode, State, Takes
 from hil.app import Overrides, Setup, check_reachable, load_setup
 from hil.check import unwatched_rows
 from hil.convert.importing import import_recording
-from hil.demo import closed_loop
 from hil.errors import ConfigError
 from hil.log.errors import LogError
-from hil.replay import replay
 from hil.replay.sent import SentCheck
-from hil.signals import Controlword, DriveState, Reason, RxFlag, new_ticks
+from hil.signals import Controlword, DriveState, RxFlag, new_ticks
 from tests.conftest import CONFIGS
+from tests.contract.lockstep import held_in_lockstep
 
 PATH = CONFIGS / "moteus.toml"
 COMMAND, ASK, REPLY, ANSWER = 0x8001 | EFF_FLAG, 0x8101 | EFF_FLAG, 0x100, 0x101
@@ -456,14 +455,5 @@ def test_a_recording_of_an_asked_drive_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.compiled
 def test_in_lockstep_it_holds_the_load_and_replays_to_the_bit(tmp_path: Path) -> None:
-    own = ('loop.clock="lockstep"', "loop.duration_s=3.5", f'log.folder="{tmp_path}"')
-    _, result, log = closed_loop(PATH, Overrides(settings=own))
-    ticks = log.ticks
-    assert result.outcome.reason == Reason.STOP_REQUESTED and result.outcome.skipped == 0
-    on = ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
-    assert 2.0 < np.abs(on["w"] - on["w_ref"]).max() < 5.0
-    late = on[(on["t_ns"] > 2_800_000_000) & (on["t_ns"] < 3_400_000_000)]
-    assert np.abs(late["w"] - late["w_ref"]).max() < 0.3
-    assert not ticks["u_q"][ticks["reason"] != 0].any()
-    verdict = replay(Path(result.log))
+    verdict = held_in_lockstep(PATH, tmp_path)
     assert verdict.verdict == "same" and not verdict.notes

@@ -19,10 +19,9 @@ from drivers.oneshot import NoAnswer
 from drivers.wire import FRAME
 from firmware_model.odrive import ODriveFrames
 from hil.app import Overrides, Setup, load_setup
-from hil.demo import closed_loop
-from hil.replay import replay
-from hil.signals import Controlword, DriveState, Reason, new_ticks
+from hil.signals import Controlword, DriveState, new_ticks
 from tests.conftest import CONFIGS
+from tests.contract.lockstep import held_in_lockstep
 
 PATH = CONFIGS / "odrive.toml"
 NODE = 1
@@ -171,13 +170,4 @@ def test_a_mistake_of_the_map_is_one_line(setting: str, said: str) -> None:
 
 @pytest.mark.compiled
 def test_in_lockstep_it_holds_the_load_and_replays_to_the_bit(tmp_path: Path) -> None:
-    own = ('loop.clock="lockstep"', "loop.duration_s=3.5", f'log.folder="{tmp_path}"')
-    _, result, log = closed_loop(PATH, Overrides(settings=own))
-    ticks = log.ticks
-    assert result.outcome.reason == Reason.STOP_REQUESTED and result.outcome.skipped == 0
-    on = ticks[ticks["state"] == int(DriveState.OPERATION_ENABLED)]
-    assert 2.0 < np.abs(on["w"] - on["w_ref"]).max() < 5.0
-    late = on[(on["t_ns"] > 2_800_000_000) & (on["t_ns"] < 3_400_000_000)]
-    assert np.abs(late["w"] - late["w_ref"]).max() < 0.3
-    assert not ticks["u_q"][ticks["reason"] != 0].any()
-    assert replay(Path(result.log)).verdict == "same"
+    assert held_in_lockstep(PATH, tmp_path).verdict == "same"

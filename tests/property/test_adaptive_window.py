@@ -28,7 +28,14 @@ from hil.control.observers.adaptive import lengths, sigmas, threshold
 from hil.control.registry import Channel, InnerLoop, SpeedFilter
 from hil.tuning.loop import count_alarms, rigid
 from hil.tuning.measure import Bench
-from tests.property.test_windows_exact import MODEL, MOTOR, NOISE, T_S, estimates
+from tests.property.test_windows_exact import (
+    MODEL,
+    MOTOR,
+    NOISE,
+    T_S,
+    assert_exact_through_losses,
+    estimates,
+)
 
 N, SHORT, FIRST = 40, 12, 3
 SIGMA = np.array([NOISE["w_noise_rad_s"], NOISE["i_noise_a"], NOISE["i_noise_a"]])
@@ -76,15 +83,7 @@ def test_small_changes_are_exact_after_the_long_length() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_through_lost_measurements(seed: int) -> None:
-    rng, p, s = np.random.default_rng(seed), law(), new_law_state()[0]
-    x, d = rng.normal(size=3), rng.normal(size=3) * 300
-    observe(p, s, *x, True, 1)
-    for k in range(400):
-        u = rng.normal(size=3) * 10
-        apply(s, *u)
-        x = MODEL.Ad @ x + MODEL.Bd @ u + MODEL.Ed @ (d if k > 200 else -d)
-        observe(p, s, *x, bool(rng.random() > 0.2) or k in (200, 399), 1)
-    np.testing.assert_allclose(s["d_hat"], d, rtol=0, atol=1e-8 * np.abs(d).max())
+    assert_exact_through_losses(law(), np.random.default_rng(seed), 300.0)
 
 
 def run(p: Any, ticks: int, d: Any, seed: int = 1, noise: float = 0.0, hold: Any = None) -> list[Any]:
