@@ -6,6 +6,7 @@ by no drive client, and is never sent in real time. An emulator without faults n
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Final
 from zlib import crc32
 
@@ -15,6 +16,8 @@ from drivers.local import EFF_FLAG
 TICK_OVER: Final = 0x1FFFFFFE | EFF_FLAG
 CLASSIC_MOST: Final = 8
 WAIT_NS: Final = 2_000_000_000
+OPEN_MOST: Final = 8
+"""SYNCs of which the end may still be on its way: an answer is behind the ends of all earlier ones."""
 
 
 def tick_over(sync: bytes) -> tuple[int, bytes]:
@@ -27,14 +30,14 @@ class LockstepLink:
 
     def __init__(self, link: Link, sync_id: int | None) -> None:
         self._link, self._sync_id = link, sync_id
-        self._sync = b""
-        self._told = self._open = False
+        self._open: deque[bytes] = deque(maxlen=OPEN_MOST)  # what ends each SYNC sent; two may be alike
+        self._told = False
 
     def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
         """Send a data frame."""
-        if can_id == self._sync_id:
-            self._sync, self._open = data, True
         self._link.send(can_id, data, fd)
+        if can_id == self._sync_id:
+            self._open.append(tick_over(data)[1])
 
     def receive(self, timeout_ns: int) -> Frame | None:
         """Return the next frame, or None when time or the tick is over."""
@@ -44,13 +47,25 @@ class LockstepLink:
             if frame is None or frame.can_id | frame.flags != TICK_OVER:
                 return frame
             self._told = True
-            if frame.data == tick_over(self._sync)[1]:
-                self._open = False
+            if self._end(frame.data):
                 return None
+
+    def _end(self, data: bytes) -> bool:
+        """Take the oldest SYNC that ``data`` names, and those before it; True when none is open any more."""
+        if data not in self._open:
+            return False
+        while self._open.popleft() != data:
+            pass
+        return not self._open
 
     def discard(self) -> int:
         """Throw away everything received and not read; return how many frames."""
-        return self._link.discard()
+        count = 0
+        while (frame := self._link.receive(0)) is not None:
+            if frame.can_id | frame.flags == TICK_OVER:
+                self._end(frame.data)
+            count += 1
+        return count
 
     def close(self) -> None:
         """Close the bus."""

@@ -175,6 +175,26 @@ def test_a_lockstep_link_ends_the_wait_with_its_own_tick_and_hides_it() -> None:
     assert tick_over(b"\x02") == (TICK_OVER, b"\x02")
 
 
+def test_of_two_syncs_alike_the_end_of_the_first_does_not_end_the_second() -> None:
+    """A command that is its own SYNC has no counter: an end that comes late is not the next one's."""
+    ends = Ends()
+    link = LockstepLink(ends, 0x80)
+    over = Frame(0x1FFFFFFE, b"\x02", TICK_OVER & ~0x1FFFFFFF, False)
+    answer = Frame(0x181, bytes(8), 0, False)
+    link.send(0x80, b"\x02")
+    ends.waiting = [answer]
+    assert [link.receive(1), link.receive(0)] == [answer, None]  # no end seen yet: nothing to wait for
+    link.send(0x80, b"\x02")
+    ends.waiting = [over, answer, over, answer]
+    assert [link.receive(1), link.receive(1), link.receive(1)] == [answer, None, answer]
+    link.send(0x80, b"\x02")
+    ends.waiting = [over]
+    assert link.discard() == 1
+    link.send(0x80, b"\x02")
+    ends.waiting = [over, answer]
+    assert [link.receive(1), link.receive(1)] == [None, answer]
+
+
 def plant(*given: dict[str, Any], w: float = 50.0) -> tuple[Any, Any, PlantFaults]:
     """State (enabled, turning), sample, faults."""
     config = load_toml(PLANT, PlantConfig, [f"fault={inline(list(given))}"])
