@@ -12,7 +12,7 @@ import importlib
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -141,11 +141,20 @@ def register(member: Observer | Law) -> None:
     laws.cache_clear()
 
 
+def _loaded(entry: EntryPoint) -> Any:
+    """What an entry point names; what its package raises is said with its name."""
+    try:
+        return entry.load()
+    except Exception as error:
+        text = f"{entry.group}: {entry.name} = {entry.value}: {type(error).__name__}: {error}"
+        raise ControlDesignError(text) from error
+
+
 def _found(group: str, kind: Any) -> dict[str, Any]:
     """Members by kind: those of the folder in the order of their names, then those of other packages."""
     names = sorted(p.stem for p in Path(__file__).with_name(group).glob("*.py") if p.stem != "__init__")
     members = [importlib.import_module(f"hil.control.{group}.{name}").MEMBER for name in names]
-    members += [entry.load() for entry in entry_points(group=f"hil.{group}")]
+    members += [_loaded(entry) for entry in entry_points(group=f"hil.{group}")]
     members += [member for member in _REGISTERED if isinstance(member, kind)]
     found: dict[str, Any] = {}
     for member in members:

@@ -57,6 +57,22 @@ def settings(law: str = "cascade", observer: str = "ftdob") -> tuple[str, ...]:
     return (f"controller={{{LAWS[law]}}}", f"observer.speed={one}", f"observer.current={one}")
 
 
+def test_a_broken_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    facts = tmp_path / "house_laws-1.0.dist-info"
+    facts.mkdir()
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: house-laws\nVersion: 1.0\n")
+    (facts / "entry_points.txt").write_text("[hil.laws]\nbroken = house_laws:MEMBER\n")
+    (tmp_path / "house_laws.py").write_text('raise RuntimeError("no licence")\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    laws.cache_clear()
+    said = "hil.laws: broken = house_laws:MEMBER: RuntimeError: no licence"
+    try:
+        with pytest.raises(ControlDesignError, match=f"^{said}$"):
+            laws()
+    finally:
+        laws.cache_clear()
+
+
 def params(*more: str) -> Any:
     return design_law(law_spec(load_toml(DEMO, RunConfig, more)), 1e-3)[0]
 
