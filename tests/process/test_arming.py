@@ -206,7 +206,7 @@ def senders(seen: Counter[tuple[int, int]]) -> set[int]:
 def test_a_shadow_beside_a_controller_sends_nothing_and_computes_the_same(
     configs: Path, settings: Settings, tmp_path: Path, channel: str
 ) -> None:
-    own, path = settings("loop.duration_s=40.0", "reference.down_at_s=30.0"), configs / "demo.toml"
+    own, path = settings("loop.duration_s=300.0", "reference.down_at_s=290.0"), configs / "demo.toml"
     monitor = Monitor(channel)
     shadow_folder = tmp_path / "shadow"
     shadow_own = (*own, f'log.folder="{shadow_folder / "logs"}"', "loop.duration_s=3.0")
