@@ -77,6 +77,7 @@ class Cia402Frames(Synchronous):
         self._objects.restart()
         self._count, self._position, self._total = -1, 0.0, 0.0
         self._error, self._told, self._ramping, self._cut = 0, 0, False, False
+        self._stops = False
         self._since = dict.fromkeys(TPDOS, 0)
         self._mappings: dict[int, tuple[Mapped, ...]] = {}
 
@@ -173,10 +174,9 @@ class Cia402Frames(Synchronous):
         self._count = (self._count + 1) % self.counter_modulus
         controlword, state = self._objects.get(0x6040), drive.state
         drive.params["watchdog_ns"] = self._objects.get(0x1400, 5) * 1_000_000
-        if self._is_quick_stop(controlword) and state["state"] == State.OPERATION_ENABLED:
-            self._quick_stop(state)
+        self._stops = self._is_quick_stop(controlword) and state["state"] == State.OPERATION_ENABLED
         self._ramping = self._ramping and controlword & 0x02 != 0
-        if self._ramping:
+        if self._stops or self._ramping:
             state["fed_ns"] = state["t_ns"]
         else:
             drive.command(self._count, controlword, self._torque(state), 0.0)
@@ -255,6 +255,9 @@ class Cia402Frames(Synchronous):
     def _after_sync(self, drive: Kernels) -> None:
         """What the drive's own loops and ramp do between two SYNCs."""
         state, period_s = drive.state, self._period_s()
+        if self._stops and state["state"] == State.OPERATION_ENABLED:
+            self._quick_stop(state)
+        self._stops = False
         w = float(state["x"][0])
         self._position += w * period_s
         enabled = state["state"] == State.OPERATION_ENABLED

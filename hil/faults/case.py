@@ -30,6 +30,7 @@ from drivers.errors import DriverError
 from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from firmware_model.node import BLACK_BOX
 from hil.app import Overrides, Setup, bus_settings, load_setup, run
+from hil.demo import set_up
 from hil.emulate import load_plant, serve
 from hil.errors import ConfigError, HilError
 from hil.faults.judge import Evidence, Result, judge
@@ -247,6 +248,8 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
     overrides = Overrides(settings=(*matrix.settings(row), *own, 'log.name="run"'))
     setup, onset_ns, acted = load_setup(path, overrides), None, True
     with emulator(path, overrides, matrix.plant_settings(row), folder / "emulator.txt") as said:
+        if setup.config.canopen is not None:
+            set_up(path, setup.config)
         controller = Forked(folder / "controller.txt", _control, setup, row.host)
         try:
             if row.host is not None:

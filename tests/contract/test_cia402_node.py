@@ -164,6 +164,18 @@ def test_quick_stop_with_a_ramp(bench: Bench) -> None:
     assert bench.tick(0x0F)[0] == QUICK_STOP and bench.tick(0x00)[0] == DISABLED
 
 
+def test_a_quick_stop_waits_for_sync_like_every_command(bench: Bench) -> None:
+    """Without SYNC it acts no more than a torque does; the newest command before a SYNC is the one."""
+    bench.enable()
+    stop, go = (struct.pack("<Hh", word, 100) for word in (0x02, 0x0F))
+    bench.put(0x205, stop)
+    assert bench.node.state["state"] == 4
+    bench.put(0x205, go)
+    assert bench.sync()[0] == ENABLED
+    bench.put(0x205, stop)
+    assert bench.node.state["state"] == 4 and bench.sync()[0] == DISABLED
+
+
 def test_the_deadline_of_the_command_latches(configs: Path) -> None:
     """1400h:5 = 3 ms: EMCY 8250h with the fault, code 0 when it is reset."""
     bench = Bench(configs)

@@ -47,6 +47,7 @@ def test_rows_in_lockstep(tmp_path: Path) -> None:
     [
         ("moteus", ["commands", "bus-off"], [None, 19, 19]),
         ("odrive", ["torques: none", "sag"], [49, 3]),
+        ("cia402", ["none reaches", "bus-off", "brown-out", "EMCY lost"], [19, 191, 51, 19, 4, 0]),
     ],
 )
 def test_rows_of_drives_by_others(
