@@ -328,9 +328,10 @@ class Wire:
 def build_params(config: PlantConfig, wire: Wire) -> Record:
     """The parameter record of a plant: a one-element array of PARAMS."""
     p = np.zeros(1, PARAMS)
+    fields: Any = p[0]
     for name, row in PARAMETERS.items():
         value = row.of(config, wire)
-        p[name] = np.inf if value is None else value
+        fields[name] = np.inf if value is None else value
     for record, load in zip(p["load"][0], config.all_loads, strict=False):
         record["kind"] = code_of(load.kind)
         for name, number in loads()[load.kind].values(load).items():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Final
 
 from hil.errorcodes import words
@@ -61,7 +61,7 @@ class End:
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form; a number that is not finite is text there."""
-        out = asdict(self) | {"text": self.text}
+        out = {name: getattr(self, name) for name in self.__slots__} | {"text": self.text}
         return {k: v if not isinstance(v, float) or math.isfinite(v) else repr(v) for k, v in out.items()}
 
 

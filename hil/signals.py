@@ -296,14 +296,21 @@ INPUTS: Final = tuple(f.name for f in FIELDS if f.role == "input")
 OUTPUTS: Final = tuple(f.name for f in FIELDS if f.role == "output")
 
 
+def _new_tick() -> TickArray:
+    tick = np.zeros(1, TICK)
+    for field in FIELDS:
+        tick[f"_{field.number}"] = tag(field.number, field.kind)
+    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
+        tick[name] = np.nan
+    return tick
+
+
+_NEW: Final = _new_tick()
+
+
 def new_ticks(count: int = 1) -> TickArray:
     """Return ``count`` zeroed tick records with their protobuf tags in place."""
-    ticks = np.zeros(count, TICK)
-    for field in FIELDS:
-        ticks[f"_{field.number}"] = tag(field.number, field.kind)
-    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
-        ticks[name] = np.nan
-    return ticks
+    return np.repeat(_NEW, count)
 
 
 Cell = Any

@@ -9,8 +9,9 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -20,13 +21,16 @@ from drivers.codec import Database
 from firmware_model.config import PlantConfig, Wire, build_params, new_sample, new_state
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
 from firmware_model.node import wire_of
+from firmware_model.plant import PARAMS, SAMPLE, STATE
 from hil.app import Setup, header_of, log_path, needed_bytes, plan_of
-from hil.control.jit import jit
-from hil.control.law import FAC, exact_after
+from hil.columns import Columns, gather
+from hil.control.jit import entry, jit
+from hil.control.law import FAC, LAW_PARAMS, LAW_STATE, exact_after
+from hil.control.references import REFERENCE
 from hil.design import Machine
 from hil.emulate import load_plant
 from hil.errors import ConfigError
-from hil.guard import NO_I_D, NO_I_Q
+from hil.guard import NO_I_D, NO_I_Q, SAFETY_PARAMS, SAFETY_STATE
 from hil.kernel import step
 from hil.log.mcapfile import RunFile
 from hil.log.recorder import check_folder
@@ -35,12 +39,13 @@ from hil.loop import RAMP_EVENT, transition_event
 from hil.reasons import explain
 from hil.report.segments import Responses
 from hil.report.statistics import Totals
-from hil.setpoint import prepare
+from hil.setpoint import SETPOINT_PARAMS, SETPOINT_STATE, prepare
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.snapshot import StateFollower
 
 Record = npt.NDArray[np.void]
 BLOCK: Final = 1024
+NO_COLUMNS: Final = Columns(0)
 
 
 @jit
@@ -77,11 +82,13 @@ def deliver(lp: Any, ps: Any, t: Any) -> None:
     on_command(ps[0], t["counter"], t["controlword"], t["u_q"], t["u_d"])
 
 
-@jit
-def ended(t: Any) -> bool:
-    """As the loop decides it."""
+def is_over(t: Any) -> bool:
+    """Whether the run ended with a tick, as the loop decides it."""
     done = t["state"] == DriveState.SWITCH_ON_DISABLED or t["state"] == DriveState.FAULT
     return bool(done and t["reason"] != Reason.NONE)
+
+
+ended = jit(is_over)
 
 
 @jit
@@ -98,34 +105,46 @@ def simulate_block(
     out: Any,
     tick: Any,
     ticks: Any,
+    floats: Any,
+    integers: Any,
+    stop: Any,
     k: int,
     period_ns: int,
     stop_at: int,
 ) -> int:
     """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended.
 
-    ``tick`` is the one before the first: what a tick does not write it has from the one before.
+    ``tick`` is the one before the first: what a tick does not write it has from the one before. Where
+    ``floats`` and ``integers`` have columns (:mod:`hil.columns`), it is as many as these have: the records
+    are written in turn then, and their fields gathered; the first with a reason goes to ``stop``.
     """
-    before = tick
-    for j in range(ticks.shape[0]):
-        if k + j > 0:
+    before, size, columns = tick, ticks.shape[0], floats.shape[1]
+    for i in range(max(size, columns)):
+        j = i % size
+        if k + i > 0:
             advance(pp[0], ps[0], period_ns)
         ticks[j] = before[0]  # now, and not right after they were written: a copy would wait for the writes
         now = ticks[j : j + 1]
         t = now[0]
-        t["k"] = k + j
-        t["t_ns"] = (k + j) * period_ns
+        t["k"] = k + i
+        t["t_ns"] = (k + i) * period_ns
         t["gap"] = 1
-        t["request"] = Request.STOP.value if k + j >= stop_at else Request.ARM.value
+        t["request"] = Request.STOP.value if k + i >= stop_at else Request.ARM.value
         receive(pp, ps, out, t, sp[0]["absent"], sp[0]["messages"])
         prepare(rp, gp, gs, ss, lp, now)
         step(sp, ss, lp, ls, now)
         deliver(lp, ps, t)
         before = now
-        if ended(t):
-            return j + 1
+        done = ended(t)
+        if columns > 0:
+            if t["reason"] != 0 and stop[0]["reason"] == 0:
+                stop[0] = t
+            if done or j + 1 == size or i + 1 == columns:
+                gather(ticks[: j + 1], floats, integers, i - j)
+        if done:
+            return i + 1
     tick[0] = before[0]
-    return int(ticks.shape[0])
+    return int(max(size, columns))
 
 
 @dataclass(slots=True)
@@ -147,29 +166,48 @@ class Simulation:
             count = advance_into(ticks, k)
             yield ticks[:count]
             k += count
-            if count < BLOCK or _over(ticks[count - 1]):
+            if count < BLOCK or is_over(ticks[count - 1]):
+                return
+
+    def columns(self, room: Columns) -> Iterator[Columns]:
+        """Fill ``room`` again and again until the run has ended, without a record kept but its stop."""
+        room.stop["reason"] = Reason.NONE
+        advance_into = self._into(room)
+        k = 0
+        while True:
+            room.count = advance_into(room.ring, k)
+            yield room
+            k += room.count
+            if room.count < room.floats.shape[1] or is_over(room.last()):
                 return
 
     def warm_up(self) -> None:
         """Compile everything: a block of no ticks changes nothing."""
         self._into()(new_ticks(0), 0)
 
-    def _into(self) -> Callable[[TickArray, int], int]:
+    def _into(self, room: Columns = NO_COLUMNS) -> Callable[[TickArray, int], int]:
         machine, tick, out = self.machine, new_ticks(), new_sample()
-        period_ns = self.setup.config.loop.period_ns
+        period_ns, run = self.setup.config.loop.period_ns, compiled_block()
 
         def into(ticks: TickArray, k: int) -> int:
-            return simulate_block(
+            return run(
                 machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
                 machine.setpoint, machine.setpoint_state,
-                self.plant, self.plant_state, out, tick, ticks, k, period_ns, self.stop_at,
+                self.plant, self.plant_state, out, tick, ticks,
+                room.floats, room.integers, room.stop, k, period_ns, self.stop_at,
             )  # fmt: skip
 
         return into
 
 
-def _over(tick: Any) -> bool:
-    return bool(ended(tick))
+@cache
+def compiled_block() -> Callable[..., int]:
+    """:func:`simulate_block` without the look at its arguments, which takes as long as twenty ticks."""
+    controller = (SAFETY_PARAMS, SAFETY_STATE, LAW_PARAMS, LAW_STATE, REFERENCE)
+    kinds = (*controller, SETPOINT_PARAMS, SETPOINT_STATE, PARAMS, STATE, SAMPLE)
+    records = [np.zeros(1, kind) for kind in kinds]
+    room = NO_COLUMNS.floats, NO_COLUMNS.integers, NO_COLUMNS.stop
+    return entry(simulate_block, *records, new_ticks(), new_ticks(0), *room, 0, 1, 0)
 
 
 def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:

@@ -6,15 +6,14 @@ and its number alone: every cache here is of a pure function.
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Mapping
-from copy import deepcopy
+from collections.abc import Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
-
-import numpy as np
 
 from drivers.codec import Database
 from drivers.errors import DriverError
@@ -24,6 +23,7 @@ from hil.app import Setup, setup_of
 from hil.campaign.figures import KEYS, Judged
 from hil.campaign.margins import design_margins
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
+from hil.columns import Columns
 from hil.config import RunConfig, override, put, read_toml, validate
 from hil.control.errors import ControlDesignError
 from hil.control.law import exact_after
@@ -57,6 +57,7 @@ class Stand:
         self._databases = lru_cache(maxsize=16)(Database)
         self._wires = lru_cache(maxsize=16)(lambda dbc, node, kind: wire_of(self._databases(dbc, node), kind))
         self._setups: dict[str, Setup] = {}
+        self._rooms: list[Columns] = []  # as many as threads were in run at once
         self.plan: Plan = Builder(where, self.own).build(table)
         for key, value in self.plan.fixed.items():
             put(self._config, key, value, path.parent)
@@ -103,9 +104,7 @@ class Stand:
         """The designed controller of some settings of the configuration."""
         key = repr(settings)  # tells 1 from 1.0 and True, which are equal
         if key not in self._setups:
-            data: dict[str, Any] = deepcopy(self._config)
-            for name, value in settings.items():
-                put(data, name, value, self.path.parent, "config")
+            data = with_settings(self._config, settings, self.path.parent, "config")
             config = validate(data, RunConfig, "config", self.path.parent)
             made = setup_of(self.path, config, self._databases)
             if len(self._setups) >= SETUPS:
@@ -116,11 +115,8 @@ class Stand:
     def _plant(self, setup: Setup, settings: Settings, seed: int | None) -> tuple[PlantConfig, Wire]:
         name = setup.config.emulator.plant if setup.config.emulator else self._plant_of({})
         folder = (self.path.parent / name).parent
-        data: dict[str, Any] = deepcopy(self._plants(name))
-        if seed is not None:
-            data["seed"] = seed
-        for key, value in settings.items():
-            put(data, key, value, folder, "plant")
+        seeded = settings if seed is None else {"seed": seed} | settings
+        data = with_settings(self._plants(name), seeded, folder, "plant")
         plant = validate(data, PlantConfig, "plant", folder)
         return plant, self._wires(folder / plant.dbc, plant.node_id, plant.protocol)
 
@@ -133,6 +129,13 @@ class Stand:
         setup = self._setup(own)
         plant, wire = self._plant(setup, plant_settings, seed)
         return setup, simulation_of(setup, plant, wire)
+
+    @contextlib.contextmanager
+    def _room(self) -> Iterator[Columns]:
+        """Room that no other thread has meanwhile; fresh pages would take longer to come by."""
+        room = self._rooms.pop() if self._rooms else Columns()
+        yield room
+        self._rooms.append(room)
 
     def run(self, case: int) -> dict[str, Any]:
         """The row of a case, whatever becomes of it."""
@@ -147,7 +150,8 @@ class Stand:
         row |= settings
         try:
             setup, simulation = self.simulation(settings, seed)
-            return row | judged(setup, simulation)
+            with self._room() as room:
+                return row | judged(setup, simulation, room)
         except REFUSALS as error:
             return row | {"ended": "refused", "passed": False, "why": first_line(error)}
         except Exception as error:  # noqa: BLE001 - one case that breaks is a row, not the end of the campaign
@@ -155,20 +159,34 @@ class Stand:
             return row | {"ended": "broke", "passed": False, "why": why}
 
 
-def judged(setup: Setup, simulation: Simulation) -> dict[str, Any]:
+def judged(setup: Setup, simulation: Simulation, room: Columns) -> dict[str, Any]:
     """Simulate; the figures, and why it ended where nobody asked."""
     found = Judged(setup.config, exact_after(setup.machine.law)[0])
-    stop = None
-    for ticks in simulation.blocks():
+    for ticks in simulation.columns(room):
         found.feed(ticks)
-        if stop is None and ticks["reason"][-1]:
-            stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
+    stop = room.stop[0] if found.reason else None
     row, machine = found.finish() | design_margins(setup), simulation.machine
     end = None if stop is None else explain(machine.safety, machine.safety_state, stop)
     if end is None:
         return row | {"end": None}
     asked = found.reason == Reason.STOP_REQUESTED
     return row | {"end": end.as_dict(), "why": row["why"] if asked else end.text}
+
+
+def with_settings(data: dict[str, Any], settings: Settings, base: Path, where: str) -> dict[str, Any]:
+    """The data with settings, itself unchanged: only the tables on the way to a key are copied."""
+    out = dict(data)
+    for key, value in settings.items():
+        place: Any = out
+        for name in key.split(".")[:-1]:
+            at: Any = int(name) if isinstance(place, list) and name.isdecimal() else name
+            try:
+                inner = place[at] = copy(place[at])
+            except (LookupError, TypeError):  # not there: put makes it, or says why not
+                break
+            place = inner
+        put(out, key, value, base, where)
+    return out
 
 
 def _opened(data: dict[str, Any], base: Path) -> dict[str, Any]:

@@ -6,26 +6,24 @@ since a log's blocks end elsewhere. Added are peaks, the noise of the voltage, a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from types import SimpleNamespace
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import numpy as np
 
 from hil.campaign.margins import DESIGN
+from hil.columns import Columns
 from hil.config import LimitsTable, RunConfig
 from hil.report.criteria import FIGURES, check_limit, demanded
+from hil.report.curves import F8
 from hil.report.excursions import Excursions
-from hil.report.segments import Responses
-from hil.report.statistics import Phases, Totals
-from hil.signals import DriveState, Reason, TickArray
+from hil.report.segments import Responses, largest
+from hil.report.statistics import Phases, Totals, usual_step
+from hil.signals import DriveState, Reason
 
-BLOCK: Final = 8192
-COLUMNS: Final = (
-    "k", "w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat", "state", "reason",
-    "rx_flags", "guard_flags", "skipped", "gap",
-)  # fmt: skip
 EXTRA: Final = {
     "w_peak_rad_s": "largest |w|, rad/s",
     "i_peak_a": "largest current, A",
@@ -38,18 +36,26 @@ EXTRA: Final = {
 KEYS: Final = (*(figure.key for figure in FIGURES), *EXTRA, *DESIGN)
 NAMES: Final = {f.key: f"{f.name}{f', {f.unit}' if f.unit else ''}" for f in FIGURES} | EXTRA | DESIGN
 
+NO_PHASES: Final = Phases()
+"""A simulation has none."""
 
-class Columns:
-    """Ticks as one plain array a field: what a figure reads of a record is 8 of its 389 bytes."""
 
-    def __init__(self, parts: Sequence[dict[str, Any]]) -> None:
-        self._of = {name: np.concatenate([part[name] for part in parts]) for name in COLUMNS}
+@lru_cache(maxsize=8)
+def times(first: int, count: int, period_ns: int) -> tuple[F8, float]:
+    """Times [s] of ticks that follow one another, and the usual step: most cases of a campaign share them."""
+    t: F8 = np.arange(first, first + count).astype(np.float64) * (period_ns * 1e-9)
+    t.flags.writeable = False
+    return t, usual_step(t)
 
-    def __getitem__(self, name: str) -> Any:
-        return self._of[name]
 
-    def __len__(self) -> int:
-        return len(self._of["k"])
+def longest(x: F8, y: F8) -> float:
+    """Largest hypot(x, y), of which only those are computed that may be it."""
+    squares = x * x + y * y
+    most = float(np.fmax.reduce(squares))
+    if 1e-200 < most < math.inf:
+        near = squares >= most * (1.0 - 1e-12)
+        x, y = x[near], y[near]
+    return largest(np.hypot(x, y))
 
 
 @dataclass(slots=True)
@@ -61,48 +67,35 @@ class Judged:
     totals: Totals = field(default_factory=Totals)
     responses: Responses = field(default_factory=Responses)
     excursions: Excursions = field(default_factory=Excursions)
-    phases: Phases = field(default_factory=Phases)
+    phases: Phases = NO_PHASES
     reason: Reason = Reason.NONE
     state: DriveState = DriveState.SWITCH_ON_DISABLED
-    _parts: list[dict[str, Any]] = field(default_factory=list)
-    _held: int = 0
     _peaks: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("w", "i", "u"), 0.0))
     _noise: tuple[float, int] = (0.0, 0)
 
     def __post_init__(self) -> None:
         self.responses.N = self.N
 
-    def feed(self, ticks: TickArray) -> None:
+    def feed(self, ticks: Columns) -> None:
         """Take the next ticks, which the simulation will overwrite."""
-        self.reason = Reason(int(ticks["reason"][-1]))
-        self._parts.append({name: ticks[name].copy() for name in COLUMNS})
-        self._held += len(ticks)
-        if self._held >= BLOCK:
-            self._flush()
-
-    def _flush(self) -> None:
-        if not self._parts:
-            return
-        found: Any = Columns(self._parts)
-        self._parts, self._held = [], 0
+        self.reason, found = Reason(ticks.last()["reason"]), cast(Any, ticks)
         with np.errstate(all="ignore"):
-            t = found["k"].astype(np.float64) * (self.config.loop.period_ns * 1e-9)
-            self.totals.feed(t, found)
+            t, step = times(int(found["k"][0]), len(found), self.config.loop.period_ns)
+            self.totals.feed(t, found, step)
             self.responses.feed(t, found)
             self.excursions.feed(t, found)
             self._extra(found)
 
-    def _extra(self, found: Any) -> None:
-        i, u = np.hypot(found["i_q"], found["i_d"]), np.hypot(found["u_q"], found["u_d"])
-        for name, values in (("w", np.abs(found["w"])), ("i", i), ("u", u)):
-            self._peaks[name] = max(self._peaks[name], float(np.nanmax(values, initial=0.0)))
+    def _extra(self, found: Columns) -> None:
+        i, u = longest(found["i_q"], found["i_d"]), longest(found["u_q"], found["u_d"])
+        for name, value in (("w", largest(np.abs(found["w"]))), ("i", i), ("u", u)):
+            self._peaks[name] = max(self._peaks[name], value)
         rests = (found["state"] == int(DriveState.OPERATION_ENABLED)) & (found["dw_ref"] == 0.0)
         steps = np.diff(found["u_q"])[rests[1:] & rests[:-1]]
         self._noise = (self._noise[0] + float(np.sum(steps * steps)), self._noise[1] + len(steps))
 
     def finish(self) -> dict[str, Any]:
         """Every figure by its key, and the verdict on each criterion."""
-        self._flush()
         with np.errstate(all="ignore"):
             self.responses.finish()
         ended = self.reason.name.lower()

@@ -13,6 +13,7 @@ import numpy as np
 
 from hil.metrics import RECOVERED_RAD_S
 from hil.report.curves import F8
+from hil.report.segments import largest
 from hil.signals import DriveState, TickArray
 
 SETTLED_S: Final = 0.3
@@ -47,7 +48,7 @@ class Excursions:
             self.unfinished = False
             return
         error = np.abs(ticks["w"] - ticks["w_ref"])
-        self.dip = max(self.dip or 0.0, float(np.nanmax(error[resting], initial=0.0)))
+        self.dip = max(self.dip or 0.0, largest(error[resting]))
         load = ticks["T_L_hat"][resting]
         self._load = (min(self._load[0], float(load.min())), max(self._load[1], float(load.max())))
         self._take(t[resting & ~(error <= RECOVERED_RAD_S)])

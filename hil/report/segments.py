@@ -5,6 +5,7 @@ A response lasts from its step to the next one, to the end of operation, or ten 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Literal
@@ -53,10 +54,10 @@ class Response:
 
 def last_outside(t: F8, deviation: F8, band: float) -> float | None:
     """Time from ``t[0]`` until |deviation| stays inside ``band``; None when it ends outside."""
-    outside = np.nonzero(~(np.abs(deviation) <= band))[0]
-    if not len(outside):
+    inside = np.abs(deviation) <= band
+    if inside.all():
         return 0.0
-    row = int(outside[-1]) + 1
+    row = len(inside) - int(inside[::-1].argmin())
     return float(t[row] - t[0]) if row < len(t) else None
 
 
@@ -71,13 +72,25 @@ def judge(kind: Literal["load", "reference"], size: float, c: dict[str, F8], N: 
     if kind == "load" and len(t) > N + 1:
         estimate = _finite(abs(c["T_L_hat"][N] - c["T_L_true"][N]))
     return Response(
-        kind, float(t[0]), move[3], float(np.nanmax(np.abs(error), initial=0.0)), recovery,
+        kind, float(t[0]), move[3], largest(np.abs(error)), recovery,
         *move[:3],
         float(np.nansum(np.abs(error[:-1]) * np.diff(t))),
-        float(np.std(error[half:])) if calm else None,
-        float(np.std(c["i_q"][half:])) if calm else None,
+        deviation(error[half:]) if calm else None,
+        deviation(c["i_q"][half:]) if calm else None,
         estimate,
     )  # fmt: skip
+
+
+def largest(sizes: F8) -> float:
+    """Largest of numbers from 0 on, those that are none left out; 0 for none."""
+    most = float(sizes.max(initial=0.0))
+    return most if most == most else float(np.fmax.reduce(sizes, initial=0.0))
+
+
+def deviation(values: F8) -> float:
+    """Standard deviation: numpy's, which takes longer to find its way than for a second of ticks."""
+    apart = values - values.sum() / len(values)
+    return math.sqrt((apart * apart).sum() / len(values))
 
 
 def _finite(value: Any) -> float | None:
@@ -93,11 +106,19 @@ def _move(c: dict[str, F8]) -> tuple[float | None, float | None, float | None, f
     if not rests or abs(size) < RECOVERED_RAD_S or not np.isfinite(w).any():
         return None, None, None, size
     share = (w - start) / size
-    beyond = float(np.nanmax(share)) - 1.0
-    low, high = np.nonzero(share >= 0.1)[0], np.nonzero(share >= 0.9)[0]
-    rise = float(t[high[0]] - t[low[0]]) if len(high) and len(low) else None
+    beyond = float(np.fmax.reduce(share)) - 1.0
+    low, high = int((share >= 0.1).argmax()), int((share >= 0.9).argmax())
+    rise = float(t[high] - t[low]) if share[high] >= 0.9 else None
     band = max(SETTLED_SHARE * abs(size), RECOVERED_RAD_S)
     return rise, 100.0 * max(beyond, 0.0), last_outside(t, w - end, band), size
+
+
+def _changes(columns: F8, before: F8, name: str) -> F8:
+    """What a column adds from tick to tick, to the one ``before`` in the first."""
+    row, out = _COLUMNS.index(name), np.empty(columns.shape[1])
+    out[0] = columns[row, 0] - before[row, 0]
+    np.subtract(columns[row, 1:], columns[row, :-1], out=out[1:])
+    return out
 
 
 class Responses:
@@ -117,17 +138,20 @@ class Responses:
 
     def feed(self, t: F8, ticks: TickArray) -> list[tuple[int, float]]:
         """Take the next ticks; return (row, weight) of the steps that begin in them."""
-        columns = np.stack([t, *(ticks[name].astype(np.float64) for name in _COLUMNS[1:])])
+        columns = np.empty((len(_COLUMNS), len(t)))
+        columns[0] = t
+        for place, name in enumerate(_COLUMNS[1:], 1):
+            columns[place] = ticks[name]
         on = ticks["state"] == int(DriveState.OPERATION_ENABLED)
         before = columns[:, :1] if self._last is None else self._last[:, None]
-        change = np.diff(columns, axis=1, prepend=before)
+        moved, stepped = (_changes(columns, before, name) for name in ("w_ref", "T_L_true"))
         found, at = [], 0
-        for row, kind in self._steps(change, on):
+        for row, kind in self._steps(moved, stepped, on):
             self._extend(columns[:, at:row])
             self._close()
             at = row
             if kind is not None:
-                size = float(change[_COLUMNS.index("T_L_true"), row])
+                size = float(stepped[row])
                 start = [columns[:, row - 1 : row] if row else before] if kind == "reference" else []
                 self._open, self._rows = (kind, size, start), len(start)
                 found.append((row, abs(size) if kind == "load" else 0.1))
@@ -136,13 +160,13 @@ class Responses:
         return found
 
     def _steps(
-        self, change: F8, on: npt.NDArray[np.bool_]
+        self, moved: F8, stepped: F8, on: npt.NDArray[np.bool_]
     ) -> Iterator[tuple[int, Literal["load", "reference"] | None]]:
         """Rows at which a response begins, or where operation ends (None)."""
-        moving = np.nonzero(change[_COLUMNS.index("w_ref")] != 0)[0]
+        moving = np.nonzero(moved)[0]
         still = np.diff(moving + self._row, prepend=self._moved)
         self._moved = int(moving[-1]) + self._row if len(moving) else self._moved
-        load = np.nonzero(np.abs(change[_COLUMNS.index("T_L_true")]) >= LOAD_STEP_N_M)[0]
+        load = np.nonzero(np.abs(stepped) >= LOAD_STEP_N_M)[0]
         ends = np.nonzero(~on & np.concatenate([[True], on[:-1]]))[0]
         rows: dict[int, Literal["load", "reference"] | None] = dict.fromkeys(ends.tolist())
         rows |= {row: "reference" for row in moving[still > REST_TICKS].tolist() if on[row]}

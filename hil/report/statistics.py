@@ -17,6 +17,10 @@ LOWEST_US: Final = 0.01
 DECADES: Final = 9
 SPECTRUM_TICKS: Final = 2048
 SPECTRUM_FIELDS: Final = ("speed error", "i_q")
+FLAG_NAMES: Final = {
+    where: [(int(flag), f"{where}: {str(flag.name).lower().replace('_', ' ')}") for flag in kind]
+    for where, kind in (("bus", RxFlag), ("guard", GuardFlag))
+}
 
 
 class Histogram:
@@ -129,19 +133,19 @@ class Totals:
     states: dict[str, int] = field(default_factory=dict)
     _k: int | None = None
 
-    def feed(self, t: F8, ticks: TickArray) -> None:
-        """Take the next ticks, at times ``t`` [s]."""
+    def feed(self, t: F8, ticks: TickArray, step: float | None = None) -> None:
+        """Take the next ticks, at times ``t`` [s]; ``step``: their :func:`usual_step`, where it is known."""
         on = ticks["state"] == int(DriveState.OPERATION_ENABLED)
         fresh = (ticks["rx_flags"] & int(RxFlag.FRESH)) != 0
         error = np.abs(ticks["w"] - ticks["w_ref"])[on]
-        finite = np.isfinite(error)
+        good = error[np.isfinite(error)]
         self.ticks += len(ticks)
         self.skipped += int(ticks["skipped"].sum(dtype=np.int64))
         self.operating += len(error)
-        self.lost += int((on & ~fresh).sum())
-        self.not_a_number += int((~np.isfinite(ticks["w"])).sum())
-        self.squared_error += float(np.sum(error[finite] ** 2))
-        self.iae += float(np.sum(error[finite])) * (float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
+        self.lost += int(np.count_nonzero(on & ~fresh))
+        self.not_a_number += len(ticks) - int(np.count_nonzero(np.isfinite(ticks["w"])))
+        self.squared_error += float(np.sum(good**2))
+        self.iae += float(np.sum(good)) * (usual_step(t) if step is None else step)
         self._gaps(ticks)
         self._count(ticks)
         for name in ("w", "i_q", "i_d", "u_q"):
@@ -154,11 +158,10 @@ class Totals:
         self._k = int(k[-1])
 
     def _count(self, ticks: TickArray) -> None:
-        for where, column, kind in (("bus", "rx_flags", RxFlag), ("guard", "guard_flags", GuardFlag)):
-            words, counts = _tally(ticks[column])
-            for flag in kind:
-                name = f"{where}: {flag.name.lower().replace('_', ' ')}"
-                seen = int(counts[(words & int(flag)) != 0].sum())
+        for where, column in (("bus", "rx_flags"), ("guard", "guard_flags")):
+            words = _tally(ticks[column])
+            for flag, name in FLAG_NAMES[where]:
+                seen = sum(count for word, count in words if word & flag)
                 self.flags[name] = self.flags.get(name, 0) + seen
         counts = np.bincount(np.minimum(ticks["state"], len(STATE_NAMES) - 1), minlength=len(STATE_NAMES))
         for name, count in zip(STATE_NAMES, counts.tolist(), strict=True):
@@ -170,15 +173,23 @@ class Totals:
         return math.sqrt(self.squared_error / self.operating) if self.operating else None
 
 
-def _tally(words: npt.NDArray[Any]) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+def usual_step(t: F8) -> float:
+    """Median of the steps from one time to the next; 0 for a single one."""
+    return float(np.median(np.diff(t))) if len(t) > 1 else 0.0
+
+
+def _tally(words: npt.NDArray[Any]) -> list[tuple[int, int]]:
     """The words that are there, and how often; without sorting, where a table of them is small."""
     if words.max() >= 1 << 16:
-        return np.unique(words, return_counts=True)
+        found, counts = np.unique(words, return_counts=True)
+        return list(zip(found.tolist(), counts.tolist(), strict=True))
     counts = np.bincount(words)
     found = np.nonzero(counts)[0]
-    return found, counts[found]
+    return list(zip(found.tolist(), counts[found].tolist(), strict=True))
 
 
 def _peak(values: npt.NDArray[Any]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.abs(finite).max()) if len(finite) else 0.0
+    """Largest finite |value|; 0 for none."""
+    sizes = np.abs(values)
+    most = float(sizes.max(initial=0.0))
+    return most if math.isfinite(most) else float(sizes.max(initial=0.0, where=np.isfinite(sizes)))

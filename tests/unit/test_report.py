@@ -20,7 +20,7 @@ from hil.report.embed import script_json
 from hil.report.envelope import BEFORE, CloseUps, Envelope, merged
 from hil.report.frames import ERROR, EXTENDED, REMOTE, Frames, id_text
 from hil.report.page import traffic
-from hil.report.segments import Responses, last_outside
+from hil.report.segments import Responses, deviation, largest, last_outside
 from hil.report.statistics import Histogram, Spectrum
 from hil.signals import DriveState, new_ticks
 from hil.simulate import simulate
@@ -111,6 +111,15 @@ def test_last_outside() -> None:
     assert last_outside(t, np.array([9.0, 0, 2, 0, 0]), 1.0) == 3.0
     assert last_outside(t, np.array([0.0, 0, 0, 0, 2]), 1.0) is None
     assert last_outside(t, np.array([0.0, np.nan, 0, 0, 0]), 1.0) == 2.0
+
+
+def test_the_quick_ways_are_numpys() -> None:
+    values = np.random.default_rng(SEED).normal(3.0, 1.0, 1237)
+    assert deviation(values) == np.std(values)
+    assert largest(np.abs(values)) == np.abs(values).max()
+    values[5] = np.nan
+    assert largest(np.abs(values)) == np.nanmax(np.abs(values))
+    assert largest(np.full(3, np.nan)) == largest(np.empty(0)) == 0.0
 
 
 def test_a_histogram_knows_percentiles_to_a_bin() -> None:
