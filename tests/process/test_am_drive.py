@@ -1,0 +1,196 @@
+"""The loop in lockstep over a drive that is wholly of strangers: plant, firmware and frames by am-sdk."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.bus import open_link
+from drivers.errors import NodeError
+from drivers.sdo import Sdo
+from hil.log.reader import open_log
+from hil.signals import DriveState
+from tests import amdrive
+from tests.amdrive import FRICTION_N_M, K_T, LOAD_N_M, LOAD_S, NODE, SAG_S, J
+from tests.canopen import bus_of
+from tests.conftest import ROOT
+from tests.process.test_run import call, flags
+
+pytestmark = pytest.mark.process
+Settings = Callable[..., tuple[str, ...]]
+BIT = 8 * amdrive.SLOT
+
+DBC = f"""VERSION "1"
+NS_ :
+BS_:
+BU_: Controller Drive
+BO_ {amdrive.GROUP} GROUP: 64 Controller
+ SG_ Torque : {BIT + 48}|16@1- (0.01,0) [-327.68|327.67] "Nm" Drive
+ SG_ Enable : {BIT + 96}|1@1+ (1,0) [0|1] "" Drive
+ SG_ FaultReset : {BIT + 98}|1@1+ (1,0) [0|1] "" Drive
+ SG_ Mode : {BIT + 100}|4@1+ (1,0) [0|15] "" Drive
+ SG_ Counter : {BIT + 104}|8@1+ (1,0) [0|255] "" Drive
+BO_ {amdrive.ANSWER} ANSWER: 16 Drive
+ SG_ Velocity : 32|16@1- (0.01,0) [-327.68|327.67] "rad/s" Controller
+ SG_ State : 80|3@1+ (1,0) [0|7] "" Controller
+ SG_ Limited : 86|1@1+ (1,0) [0|1] "" Controller
+ SG_ Echo : 96|8@1+ (1,0) [0|255] "" Controller
+ SG_ Winding : 104|8@1+ (1,-40) [-40|215] "degC" Controller
+ SG_ Supply : 112|16@1+ (0.01,0) [0|655.35] "V" Controller
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN_FD";
+"""
+
+CONFIG = f"""[loop]
+rate_hz = 1000
+pacing = "sync"
+clock = "lockstep"
+duration_s = 1.4
+[bus]
+interface = "hil-local"
+channel = "am"
+fd = true
+data_bitrate = 5000000
+[drive]
+dbc = "am.dbc"
+torque_constant_n_m_a = {K_T}
+current_limit_a = 27.0
+speed_filter = {{ kind = "first-order", pole_rad_s = 1885.0 }} # its vel_filter_hz, 300
+[drive.signals]
+poll = "GROUP"
+speed = "ANSWER.Velocity"
+state = "ANSWER.State"
+limited = "ANSWER.Limited"
+echo = "ANSWER.Echo"
+temperature_motor = "ANSWER.Winding"
+v_dc = "ANSWER.Supply"
+torque_ref = "GROUP.Torque"
+enable = "GROUP.Enable"
+reset = "GROUP.FaultReset"
+counters = ["GROUP.Counter"]
+[drive.signals.states] # one bit enables it; it walks the states between by itself
+0 = "off"
+1 = "off"
+2 = "off"
+3 = "off"
+4 = "operation enabled"
+5 = "quick stop active"
+6 = "fault reaction active"
+7 = "fault"
+[drive.signals.constants]
+"GROUP.Mode" = 1 # CST
+[motor] # its torque constant is 1.5 n_p psi_f, at the output
+R_s_ohm = 1.0
+L_d_h = 1e-3
+L_q_h = 1e-3
+psi_f_wb = {K_T / 31.5}
+n_p = 21
+J_kg_m2 = {J}
+B_f_n_m_s = 0.0
+[controller]
+kind = "speed"
+speed_pole_rad_s = 30.0
+[observer.speed]
+kind = "ftdob"
+gamma_1_rad_s = 25.0
+gamma_2_rad_s = 58.0
+delay_ms = 12.0
+[limits]
+w_max_rad_s = 10.0
+i_max_a = 12.0
+i_trip_a = 25.0
+dtorque_max_n_m = 20.0
+v_dc_min_v = 40.0
+v_dc_max_v = 55.0
+temperature_max_c = 120.0
+i_continuous_a = 12.0
+i2t_max_a2s = 400.0
+[reference]
+kind = "s-curve"
+w_rad_s = 5.0
+rate_rad_s2 = 20.0
+jerk_rad_s3 = 1000.0
+at_s = 0.05
+down_at_s = 1.1
+"""
+
+
+@contextlib.contextmanager
+def am_drive(channel: str, *words: str) -> Iterator[None]:
+    """The drive as a process of its own."""
+    command = [sys.executable, "-m", "tests.amdrive", channel, *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "ready\n"
+            yield
+        finally:
+            process.terminate()
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    (tmp_path / "am.dbc").write_text(DBC, encoding="utf-8")
+    config = tmp_path / "am.toml"
+    config.write_text(CONFIG, encoding="utf-8")
+    return config
+
+
+def ran(path: Path, own: tuple[str, ...]) -> tuple[int, dict[str, Any], Any]:
+    """Exit code, what is said, and the log's ticks in operation."""
+    command = [sys.executable, "-m", "hil.cli", "run", str(path), "--json", *flags(own)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)  # it may compile
+    assert done.stdout, done.stderr
+    result = json.loads(done.stdout)
+    ticks = open_log(Path(result["log"])).ticks
+    return done.returncode, result, ticks[ticks["state"] == DriveState.OPERATION_ENABLED]
+
+
+def test_the_loop_holds_a_strangers_motor(path: Path, settings: Settings, channel: str) -> None:
+    """Their dry friction is the first load, a step of 4 N m the second: each within 2 % of the step."""
+    with am_drive(channel):
+        code, result, on = ran(path, settings())
+    assert (code, result["ended"]) == (0, "stop_requested")
+    k, load = on["k"], on["T_L_hat"]
+    step = round(1e3 * LOAD_S)
+    before, risen, held = (
+        (k > low) & (k < high) for low, high in ((100, 495), (step + 18, 1050), (800, 1050))
+    )
+    assert np.abs(load[before] - FRICTION_N_M).max() < 0.02 * LOAD_N_M
+    assert np.abs(load[risen] - FRICTION_N_M - LOAD_N_M).max() < 0.02 * LOAD_N_M
+    assert (
+        np.abs(on["w"][held] - 5.0).max() < 0.02 and 0.5 < 5.0 - on["w"][(k >= step) & (k < 1050)].min() < 1.0
+    )
+    replayed = call("replay", result["log"])
+    assert replayed.returncode == 0, replayed.stdout
+
+
+def test_a_trip_of_theirs_ends_the_run(path: Path, settings: Settings, channel: str) -> None:
+    """Their supply falls to 20 V: it trips, and says it in its state alone."""
+    with am_drive(channel, "trips"):
+        code, result, on = ran(path, settings("limits.v_dc_min_v=0.0"))
+    assert (code, result["ended"]) == (1, "drive_fault")
+    assert abs(int(on["k"][-1]) - round(1e3 * SAG_S)) < 5
+
+
+def test_their_dictionary_and_its_aborts(channel: str) -> None:
+    """Rated torque [mN m]; read-only, not there, and of another length are refused."""
+    with am_drive(channel), contextlib.closing(open_link(bus_of(channel))) as link:
+        sdo = Sdo(link, NODE, "here", 10.0)
+        assert sdo.read_int(0x6076) == 34100 and sdo.optional_int(0x1234) is None
+        assert (sdo.read_int(0x2902, 2), sdo.read_int(0x2902, 3)) == (amdrive.GROUP, amdrive.SLOT // 16)
+        for index, size, said in (
+            (0x6041, 2, "0x06010002"),
+            (0x1234, 2, "0x06020000"),
+            (0x60E0, 4, "0x06070010"),
+        ):
+            with pytest.raises(NodeError, match=f"{index:04X}h.*abort {said}, "):
+                sdo.write(index, 0, 1, size)
