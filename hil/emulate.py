@@ -126,5 +126,6 @@ def _serve(config: RunConfig, node: Node, link: Link, what: str) -> None:
     try:
         node.run(lambda: stopped)
     finally:
+        realtime.release()  # to give so much locked memory back takes tens of milliseconds
         link.close()
     print(node.summary(), flush=True)  # noqa: T201

@@ -197,11 +197,11 @@ class Rights:
         """Take what is granted. The collector would touch every page that is shared with the controller."""
         gc.disable()
         gc.freeze()
+        if self.lock_memory:
+            realtime.lock_as_touched()
         if self.priority > 0:
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(self.priority + 1, 99)))
-        if self.lock_memory:
-            realtime.lock_as_touched()
         realtime.keep_off(0, self.loop_cpu)
 
 

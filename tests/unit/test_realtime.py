@@ -1,14 +1,18 @@
-"""Where the processes of a run may go."""
+"""Where the processes of a run may go, and in which order they ask for their rights."""
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
+from hil import realtime
+from hil.config import RealtimeTable
+from hil.guardian import Rights
 from hil.realtime import keep_off
 
 
@@ -33,3 +37,31 @@ def test_one_that_has_gone_is_left_to_the_loop() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
     keep_off(process.pid, min(os.sched_getaffinity(0)))
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda: realtime.acquire(RealtimeTable()),
+        lambda: realtime.probe(RealtimeTable()),
+        lambda: Rights(priority=50, lock_memory=True).acquire(),
+    ],
+    ids=["run and emulator", "check", "guardian"],
+)
+def test_memory_is_locked_before_fifo_is_asked_for(
+    ask: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half a second under FIFO on each core ended another run on the machine, its drive in watchdog fault."""
+    asked: list[str] = []
+
+    def memory(*_: object) -> list[realtime.Grant]:
+        asked.append("memory")
+        return []
+
+    monkeypatch.setattr(realtime, "_memory", memory)
+    monkeypatch.setattr(realtime, "lock_as_touched", memory)
+    monkeypatch.setattr(os, "sched_setscheduler", lambda *_: asked.append("fifo"))
+    for name in ("disable", "freeze"):
+        monkeypatch.setattr(gc, name, lambda: None)
+    ask()
+    assert asked == ["memory", "fifo"]
