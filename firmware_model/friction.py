@@ -33,12 +33,17 @@ def stribeck_coefficient(p: Any, c: Any, k: int) -> float:
     extra = p["static"] - p["coulomb"]
     if extra == 0.0 or c[SLIDE, 0] == 0.0:
         return 0.0
-    rate, w, e = -c[SLIDE, 0] / p["stribeck"], c[0], c[STRIBECK]
-    if k == 0:
-        e[0] = math.exp(rate * w[0])
-    else:
-        total = 0.0
-        for j in range(1, k + 1):
-            total += j * rate * w[j] * e[k - j]
-        e[k] = total / k
+    e = c[STRIBECK]
+    e[k] = exponential(-c[SLIDE, 0] / p["stribeck"], c[0], e, k)
     return float(extra * e[k])
+
+
+@jit
+def exponential(rate: float, w: Any, e: Any, k: int) -> float:
+    """Coefficient k of e^{rate w} from those of w and its own before."""
+    if k == 0:
+        return math.exp(rate * w[0])
+    total = 0.0
+    for j in range(1, k + 1):
+        total += j * rate * w[j] * e[k - j]
+    return total / k

@@ -57,25 +57,80 @@ def link_series(p: Any, s: Any, c: Any, fed: bool) -> None:
 
 
 @jit
-def advance_link(p: Any, s: Any, c: Any, h: float) -> None:
-    """Advance the link by h [s]; row POWER holds the motor's power about the beginning of h."""
+def link_longer(p: Any, conductance: float, fed: bool, power: Any, v: Any, inverse: Any) -> Any:
+    """The series v and 1 / v, here tuples, with one coefficient more."""
+    k = len(v) - 1
+    current = -conductance * v[k] - product(power, inverse, k)
+    if k == 0 and fed:
+        current += p["v_dc"] / p["rectifier"]
+    v = (*v, current / (p["capacitance"] * (k + 1)))
+    total = 0.0
+    for j in range(1, k + 2):
+        total += v[j] * inverse[k + 1 - j]
+    return v, (*inverse, -total * inverse[0])
+
+
+@jit
+def held_link_series(p: Any, s: Any, power: Any, fed: bool) -> Any:
+    """:func:`link_series` as a tuple, of the motor's power as one."""
+    conductance = (1.0 / p["rectifier"] if fed else 0.0) + (
+        1.0 / p["brake_resistance"] if s["braking"] else 0.0
+    )
+    v, inverse = link_longer(p, conductance, fed, power, (s["v_dc"],), (1.0 / s["v_dc"],))
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
+    v, _ = link_longer(p, conductance, fed, power, v, inverse)
+    return v
+
+
+@jit
+def link_step(p: Any, s: Any, v: Any, left: float) -> float:
+    """Advance the link along its series to the next edge, by at most ``left`` [s]; return how far."""
+    edge = p["brake_off"] if s["braking"] else p["brake_on"]
+    at_edge = first_crossing(v, edge, left) if edge < math.inf else math.inf
+    at_rectifier = first_crossing(v, p["v_dc"], left)
+    step = min(left, at_edge, at_rectifier)
+    s["v_dc"] = max(evaluate(v, step), LEAST_V)
+    if at_edge == step:
+        s["v_dc"], s["braking"] = edge, 1 - s["braking"]
+    elif at_rectifier == step:
+        s["v_dc"] = p["v_dc"]
+    return float(step)
+
+
+@jit
+def advance_held_link(p: Any, s: Any, c: Any, power: Any, h: float) -> None:
+    """:func:`advance_link` with the power as a tuple: nearly always one step is all, the rest goes there."""
     if s["v_dc"] >= p["brake_on"]:
         s["braking"] = 1
-    left = h
-    for n in range(EDGES):
-        fed = conducts(p, s, c[POWER, 0])
-        link_series(p, s, c, fed)
-        step = left if n == EDGES - 1 else within(c[LINK], left, LINK_ERROR_V)
-        edge = p["brake_off"] if s["braking"] else p["brake_on"]
-        at_edge = first_crossing(c[LINK], edge, step) if edge < math.inf else math.inf
-        at_rectifier = first_crossing(c[LINK], p["v_dc"], step)
-        step = min(step, at_edge, at_rectifier)
-        s["v_dc"] = max(evaluate(c[LINK], step), LEAST_V)
-        if at_edge == step:
-            s["v_dc"], s["braking"] = edge, 1 - s["braking"]
-        elif at_rectifier == step:
-            s["v_dc"] = p["v_dc"]
+    v = held_link_series(p, s, power, conducts(p, s, power[0]))
+    step = link_step(p, s, v, within(v, h, LINK_ERROR_V))
+    if h - step > 0.0:
+        for k in range(ORDER + 1):
+            c[POWER, k] = power[k]
+        shifted(c[POWER], step)
+        link_steps(p, s, c, h - step, 1)
+
+
+@jit
+def link_steps(p: Any, s: Any, c: Any, left: float, first: int) -> None:
+    """Advance the link by ``left`` [s], of which so many steps are done."""
+    for n in range(first, EDGES):
+        link_series(p, s, c, conducts(p, s, c[POWER, 0]))
+        step = link_step(p, s, c[LINK], left if n == EDGES - 1 else within(c[LINK], left, LINK_ERROR_V))
         left -= step
         if left <= 0.0:
             return
         shifted(c[POWER], step)
+
+
+@jit
+def advance_link(p: Any, s: Any, c: Any, h: float) -> None:
+    """Advance the link by h [s]; row POWER holds the motor's power about the beginning of h."""
+    if s["v_dc"] >= p["brake_on"]:
+        s["braking"] = 1
+    link_steps(p, s, c, h, 0)

@@ -14,9 +14,10 @@ section I.8). A substep h leaves a relative error of about (r h)^9 / 9!, r = n_p
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from firmware_model.friction import level, stribeck_coefficient
+from firmware_model.friction import exponential, level, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import held_load, varying_load
 from firmware_model.plant import DRIVE, SLIDE
@@ -108,6 +109,44 @@ def plain_series(p: Any, x: Any, T_held: float, u_q: float, u_d: float, on: bool
     w, q, d = longer(m, added, on, w, q, d)
     w, q, d = longer(m, added, on, w, q, d)
     return longer(m, added, on, w, q, d)
+
+
+@jit
+def rubbed(m: Any, added: Any, friction: Any, on: bool, w: Any, q: Any, d: Any, e: Any) -> Any:
+    """:func:`longer` for a shaft with ``friction``: (way that it slides or 0, T_c, T_s - T_c, -way / w_s).
+
+    So does ``e`` = e^{-|w| / w_s}; last comes coefficient k of what drives a shaft that sticks.
+    """
+    k, inverse_J = len(w) - 1, m[-3]
+    slide, T_coulomb, extra, rate = friction
+    dw, dq, dd = slopes(m, w, q, d, k)
+    if k == 0:
+        dw, dq, dd = dw + added[0], dq + added[1], dd + added[2]
+    drive = dw / inverse_J if slide == 0.0 else 0.0
+    dw -= slide * ((T_coulomb if k == 0 else 0.0) + extra * e[k]) * inverse_J
+    dw *= abs(slide)
+    share = 1.0 / (k + 1)
+    dq, dd = (dq * share, dd * share) if on else (0.0, 0.0)
+    w = (*w, dw * share)
+    fall = exponential(rate, w, e, k + 1) if slide * extra != 0.0 else 0.0
+    return w, (*q, dq), (*d, dd), (*e, fall), drive
+
+
+@jit
+def rubbed_series(p: Any, x: Any, T_held: float, u_q: float, u_d: float, on: bool, friction: Any) -> Any:
+    """:func:`series` with friction and without loads that vary, as tuples: w, i_q, i_d and what drives."""
+    m, (slide, _, extra, rate) = constants(p), friction
+    added = held(p, m, T_held, u_q, u_d)
+    e = (math.exp(rate * x[0]) if slide * extra != 0.0 else 0.0,)
+    w, q, d, e, drive_0 = rubbed(m, added, friction, on, (x[0],), (x[1],), (x[2],), e)
+    w, q, d, e, drive_1 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_2 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_3 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_4 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_5 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_6 = rubbed(m, added, friction, on, w, q, d, e)
+    w, q, d, e, drive_7 = rubbed(m, added, friction, on, w, q, d, e)
+    return w, q, d, (drive_0, drive_1, drive_2, drive_3, drive_4, drive_5, drive_6, drive_7, 0.0)
 
 
 @jit

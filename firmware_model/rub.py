@@ -12,9 +12,9 @@ from typing import Any
 
 from firmware_model.friction import level
 from firmware_model.jit import jit
-from firmware_model.link import advance_link
-from firmware_model.load import load_torque
-from firmware_model.motor import series
+from firmware_model.link import advance_held_link, advance_link
+from firmware_model.load import held_load, load_torque
+from firmware_model.motor import rubbed_series, series
 from firmware_model.plant import DRIVE, POWER, SLIDE, STRIBECK
 from firmware_model.series import ORDER, evaluate, first_crossing, within
 
@@ -72,8 +72,69 @@ def piece(p: Any, c: Any, most: float, left: float) -> float:
 
 
 @jit
+def slid(p: Any, s: Any, t: float, h: float, most: float, on: bool) -> Any:
+    """:func:`slide` without loads that vary: w, i_q, i_d, what drives, and the way that the shaft slides."""
+    w, T_held, T_coulomb = s["x"][0], held_load(p, t + 0.5 * h) + s["T_commanded"], level(p, t + 0.5 * h)
+    way, extra = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0), p["static"] - p["coulomb"]
+    while True:
+        friction = way, T_coulomb, extra, -way / p["stribeck"]
+        a, q, d, drive = rubbed_series(p, s["x"], T_held, s["u_q"], s["u_d"], on, friction)
+        if way != 0.0 or not abs(drive[0]) >= most * BREAKS:
+            return a, q, d, drive, way
+        way = 1.0 if drive[0] > 0.0 else -1.0
+
+
+@jit
+def slid_piece(w: Any, drive: Any, way: float, most: float, left: float) -> float:
+    """:func:`piece` of :func:`slid`."""
+    if way == 0.0:
+        return min(left, first_crossing(drive, most, left), first_crossing(drive, -most, left))
+    step = within(w, left, W_ERROR)
+    return min(step, first_crossing(w, 0.0, step))
+
+
+@jit
+def power_of(u_q: float, u_d: float, q: Any, d: Any, on: bool) -> Any:
+    """Coefficients of the motor's power, as a tuple."""
+    if not on:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    return (
+        1.5 * (u_q * q[0] + u_d * d[0]),
+        1.5 * (u_q * q[1] + u_d * d[1]),
+        1.5 * (u_q * q[2] + u_d * d[2]),
+        1.5 * (u_q * q[3] + u_d * d[3]),
+        1.5 * (u_q * q[4] + u_d * d[4]),
+        1.5 * (u_q * q[5] + u_d * d[5]),
+        1.5 * (u_q * q[6] + u_d * d[6]),
+        1.5 * (u_q * q[7] + u_d * d[7]),
+        1.5 * (u_q * q[8] + u_d * d[8]),
+    )
+
+
+@jit
+def rub_held(p: Any, s: Any, t: float, h: float, on: bool) -> None:
+    """:func:`rub` without loads that vary: as tuples, as :func:`firmware_model.motor.plain_series` is."""
+    x, left = s["x"], h
+    most = level(p, t + 0.5 * h) + p["static"] - p["coulomb"]
+    for n in range(PIECES):
+        w, q, d, drive, way = slid(p, s, t, left, most, on)
+        step = slid_piece(w, drive, way, most, left) if n < PIECES - 1 else left
+        x[0], x[1], x[2] = evaluate(w, step), evaluate(q, step), evaluate(d, step)
+        if way * x[0] <= 0.0:
+            x[0] = 0.0
+        if p["capacitance"] > 0.0:
+            advance_held_link(p, s, s["series"], power_of(s["u_q"], s["u_d"], q, d, on), step)
+        t, left = t + step, left - step
+        if left <= 0.0:
+            return
+
+
+@jit
 def rub(p: Any, s: Any, t: float, h: float, on: bool) -> None:
     """Advance motor and DC link from t [s] by h [s]."""
+    if p["rubs"] and not p["varying"]:
+        rub_held(p, s, t, h, on)
+        return
     x, c, left = s["x"], s["series"], h
     most = level(p, t + 0.5 * h) + p["static"] - p["coulomb"]
     for n in range(PIECES):

@@ -165,6 +165,37 @@ LINK = {
 }
 
 
+@pytest.mark.parametrize("inverter", [{}, LINK, LINK | {"capacitance_f": 2e-5}])
+@pytest.mark.parametrize("static", [0.4, 0.9])
+def test_series_as_tuples_and_in_their_room_give_the_same_bits(static: float, inverter: Any) -> None:
+    """A plant whose loads are said to vary, and do not, takes the way of those that do."""
+    friction = STRIBECK | {"static_n_m": static}
+    brake = {"kind": "brake", "torque_n_m": 0.3, "at_s": 0.1}
+    p, s = plant(friction=friction, load=[brake], inverter=inverter, seed=1)
+    general, other = plant(friction=friction, load=[brake], inverter=inverter, seed=1)
+    general["varying"] = 1
+    s["x"][0] = other["x"][0] = 30.0
+    signs, links = set(), set()
+    for k in range(300):  # to and fro and at rest, the gates off at times; often enough to brake
+        u_q = (40.0, 2.6, 90.0, 1.0, -60.0, -2.0, 3.0, 120.0, -120.0, 0.0)[k // 30]
+        for record in (s, other):
+            if k == 270:
+                record["x"] = 0.3, 0.0, 0.0  # it comes to rest
+            enabled(record, u_q, record["x"][0], record["x"][1])
+            record["state"] = int(State.SWITCH_ON_DISABLED if k % 30 > 27 else State.OPERATION_ENABLED)
+            record["u_d"], record["T_commanded"], record["error"] = -0.1 * u_q, 0.05, 0
+        advance(p, s, 1_000_000)
+        advance(general, other, 1_000_000)
+        assert s["x"].tobytes() == other["x"].tobytes(), k
+        assert (s["v_dc"], s["braking"]) == (other["v_dc"], other["braking"]), k
+        signs.add(float(np.sign(s["x"][0])))
+        links.add((float(s["v_dc"]), int(s["braking"])))
+    assert signs == {-1.0, 0.0, 1.0}
+    brakes = inverter.get("capacitance_f") == 2e-5
+    assert len(links) > 100 if inverter else len(links) == 1
+    assert {braking for _, braking in links} == ({0, 1} if brakes else {0})
+
+
 def test_what_the_motor_gives_back_is_in_the_capacitor_to_the_joule() -> None:
     """0.5 C (v^2 - v_0^2) = -int P dt while neither rectifier nor chopper conducts."""
     p, s = plant(inverter={"capacitance_f": 1e-3})
