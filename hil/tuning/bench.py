@@ -32,7 +32,7 @@ def speed_drive(path: Path, overrides: Overrides) -> Setup:
     if kind not in (CASCADE, PI):
         raise HilError(
             f"{path}: controller.kind {setup.config.controller.kind} asks for no voltage; only laws that do "
-            "can be tuned"
+            "can be tuned; the margins of this one: hil check"
         )
     return setup
 

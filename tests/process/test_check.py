@@ -88,6 +88,26 @@ def test_an_interface_that_is_not_there(configs: Path, settings: Settings) -> No
     assert rows["drive"]["verdict"] == "fail"
 
 
+def test_a_slow_pll_is_refused_unless_it_is_told(configs: Path, settings: Settings) -> None:
+    """VESC's default PLL: a run that does not know it is refused; one that knows it is told its margins."""
+    pll = 'kind="pll",pole_1_rad_s=15.0,pole_2_rad_s=1985.0'
+    path, plant = configs / "current.toml", configs / "plants" / "current.toml"
+    own = settings("drive.heartbeat_timeout_s=0.2")
+    for command in ("check", "run"):
+        done = call(command, str(path), *flags((*own, f"drive.speed_filter={{{pll},modelled=false}}")))
+        assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+        assert "drive.speed_filter: the loop is not stable through a PLL" in done.stderr
+    text = plant.read_text(encoding="utf-8")
+    plant.write_text(
+        text.replace("[firmware]\n", f"[firmware]\nspeed_filter = {{ {pll} }}\n"), encoding="utf-8"
+    )
+    _, rows, _ = checked(path, own)
+    assert rows["speed filter"]["verdict"] == "fail" and "tells no filter" in rows["speed filter"]["found"]
+    _, rows, _ = checked(path, (*own, f"drive.speed_filter={{{pll}}}"))
+    found = rows["speed filter"]["found"]
+    assert "which the observer knows: Ms 1.60, gain margin" in found and "delay" in found
+
+
 def test_the_table_keeps_its_brackets(configs: Path, settings: Settings) -> None:
     own = settings("drive.heartbeat_timeout_s=0.3", 'log.folder="/proc/none"')
     done = call("check", str(configs / "demo.toml"), *flags(own))

@@ -263,7 +263,7 @@ def test_designs_that_can_not_be_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("config", "said"), [("paper", "only speed drives"), ("current", "asks for no voltage")]
+    ("config", "said"), [("paper", "only speed drives"), ("current", "the margins of this one: hil check")]
 )
 def test_what_asks_for_no_voltage_is_refused(
     config: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
