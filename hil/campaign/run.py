@@ -189,6 +189,7 @@ def finish(job: Any, held: Folder, used: Workers, size: int, seen: Seen | None) 
 
     with _kept(held):
         engine.run(job, engine.batches(held.open_spans(), size), used, take)
+    held.merge()
     passed = held.columns("passed")["passed"]
     write_page(held)
     return Result(held, len(passed), int(passed.astype(bool).sum()), rate.seconds, rate.per_s)

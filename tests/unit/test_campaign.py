@@ -373,6 +373,37 @@ def test_a_folder_keeps_its_rows_and_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert repr(rows_of(out)) == repr(before)  # no number is not equal to itself
 
 
+def test_many_parts_become_few_and_a_crash_meanwhile_leaves_each_row_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, out = plan_file(tmp_path, f"samples = 9\n[random]\n{J} = [0.01, 0.012]\n"), tmp_path / "out"
+    rows = hil.campaign(path, out).rows()
+    held = store.open_folder(out)
+    held.parts()[0].unlink()
+    for row in rows:
+        held.add([row])
+        held.flush()
+    before = {part.name: part.read_bytes() for part in held.parts()}
+    monkeypatch.setattr(store, "MERGED_ROWS", 4)
+    held.merge()
+    sizes = [len(store.read_columns(part, ["case"])["case"]) for part in held.parts()]
+    assert len(before) == 9 and sorted(sizes) == [1, 4, 4] and held.done().all()
+    for name, content in list(before.items())[:3]:  # as if it had ended before they were removed
+        (out / "rows" / name).write_bytes(content)
+    again = store.open_folder(out).columns(*held.schema)
+    assert again["case"].tolist() == list(range(9))
+    assert again["iae_rad"].tolist() == [row["iae_rad"] for row in rows]
+    monkeypatch.setattr(store, "_write_table", full_disk)
+    monkeypatch.setattr(store, "MERGED_ROWS", 100)
+    parts = store.open_folder(out).parts()
+    store.open_folder(out).merge()
+    assert store.open_folder(out).parts() == parts and len(parts) == 6
+
+
+def full_disk(*_: Any) -> None:
+    raise OSError(errno.ENOSPC, "no space")
+
+
 def test_another_plan_another_file_another_version_are_refused_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], configs: Path
 ) -> None:
