@@ -356,6 +356,20 @@ def test_arming_counts_and_gives_up() -> None:
     assert guard.s["state"][0] == DriveState.FAULT_REACTION_ACTIVE
 
 
+@pytest.mark.parametrize("rules", [0, 1])
+def test_periods_that_were_skipped_while_arming_count(rules: int) -> None:
+    """From this version on: a log of before replays by its ticks alone."""
+    guard, found = bench(enable_ticks=7, rules=rules), []
+    guard.s["state"], guard.t["drive_state"] = READY, int(DriveState.READY_TO_SWITCH_ON)
+    guard.s["echo"], guard.t["request"] = 0, int(Request.ARM)
+    for gap in (0, 1, 2, 3):
+        guard.t["gap"] = gap
+        assert ask(arming, guard) == Controlword.SWITCH_ON
+        found.append(int(guard.s["armed_gaps"][0]))
+    assert found == ([0, 0, 1, 3] if rules else [0, 0, 0, 0])
+    assert (ask(arming, guard) == Controlword.DISABLE_VOLTAGE) == bool(rules)
+
+
 def test_causes_while_arming_in_order() -> None:
     guard, got = bench(trip_ticks=1, enable_ticks=0), []
     guard.s["armed_ticks"] = 1
