@@ -1,6 +1,6 @@
 """What a case of a campaign costs, beside a case as it was simulated before, and how workers add up.
 
-    python -m benchmarks.campaign [--json] [--cases N] [--full] [--base PYTHON] [--motulator PYTHON]
+    python -m benchmarks.campaign [--json] [--cases N] [--full] [--huge] [--base PYTHON] [--motulator PYTHON]
 
 Processor time and ratios of one run, so that other load on the machine matters little:
 
@@ -8,10 +8,11 @@ Processor time and ratios of one run, so that other load on the machine matters 
   done anew, as `hil simulate --sweep` did until campaigns came: files read, DBC parsed, law designed;
 * the same with the controller varied, which is designed for each case;
 * one worker and two over N cases: wall time, processor time of all, and peak memory of a worker;
-* `--full`: 10,000 and 100,000 cases on two workers;
-* `--base`: a tick of the compiled simulation here and in another version, whose interpreter is given, by
-  turns over that version's demo: `git worktree add ../base REVISION`, a virtual environment in it and
-  `pip install -e .`;
+* `--full`: 10,000 cases on two workers, three minutes of two cores; `--huge`: 100,000, half an hour;
+* `--base`: a tick of the compiled simulation, and a case of a campaign or of the sweep before them, here and
+  in another version, whose interpreter is given, by turns over that version's demo: `git worktree add
+  ../base REVISION`, a virtual environment in it and `pip install -e .`;
+* how much a worker's memory grows by a case, from the smallest and the largest of these campaigns;
 * motulator's own loop over the same motor at the same control rate. It integrates the motor with scipy's
   adaptive RK45 between control steps and keeps each step; we advance a Taylor series of order 8 twice a tick,
   through the wire's resolution, guard and supervisor, and keep figures. Neither does all that the other does.
@@ -47,6 +48,8 @@ from hil.simulate import simulate_ticks
 from hil.view import key_values, show
 
 REPEATS, TURNS, CASE_S = 40, 3, 6.0
+LOOK_S = 0.5
+"""From one look at all processes to the next: more often, it takes a share of the client's time."""
 PLANT = """[random]
 "plant:motor.J_kg_m2" = { percent = 20 }
 "plant:motor.R_s_ohm" = { percent = 20 }
@@ -114,7 +117,7 @@ def watched(found: dict[str, float]) -> Iterator[None]:
     stop, seconds = threading.Event(), dict[int, float]()
 
     def look() -> None:
-        while not stop.wait(0.1):
+        while not stop.wait(LOOK_S):
             for process in psutil.Process().children(recursive=True):
                 with contextlib.suppress(psutil.Error):
                     found["peak_mb"] = max(found.get("peak_mb", 0.0), process.memory_info().rss / 1e6)
@@ -152,9 +155,9 @@ def beside_motulator(python: str, case_ms: float) -> dict[str, Any]:
     return found
 
 
-def beside_base(base: str) -> dict[str, Any]:
-    """Time of a tick [us] of this version and of the one of interpreter ``base``, over the latter's demo."""
-    script, best = str(HERE / "simulated_tick.py"), {base: float("inf"), sys.executable: float("inf")}
+def beside_base(base: str, script: str, key: str) -> dict[str, Any]:
+    """What ``script`` measures of this version and of interpreter ``base``'s, over the latter's demo."""
+    script, best = str(HERE / script), {base: float("inf"), sys.executable: float("inf")}
     config: tuple[str, ...] = ()
     for _ in range(TURNS):
         for python in best:
@@ -162,39 +165,53 @@ def beside_base(base: str) -> dict[str, Any]:
             if "missing" in found:
                 return found
             config = (found["config"],)
-            best[python] = min(best[python], found["us_a_tick"])
+            best[python] = min(best[python], found[key])
     there, here = best[base], best[sys.executable]
-    return {"there_us_a_tick": there, "here_us_a_tick": here, "times_as_fast": there / here}
+    return {f"there_{key}": there, f"here_{key}": here, "times_as_fast": there / here}
 
 
-def measure(cases: int, full: bool, base: str | None, python: str) -> dict[str, Any]:
-    """Everything, by name."""
+def campaigns(folder: Path, cases: int, more: list[int]) -> dict[str, Any]:
+    """One worker and two over ``cases``, two over each of ``more``, and what these tell together."""
+    runs = [(cases, 1), (cases, 2), *((count, 2) for count in more)]
+    found = {run: whole(folder, *run) for run in runs}
+    out: dict[str, Any] = {f"{count} cases, workers {n}": value for (count, n), value in found.items()}
+    out["one worker over two"] = found[cases, 1]["wall_s"] / found[cases, 2]["wall_s"]
+    if more:
+        grown_mb = found[more[-1], 2]["peak_mb"] - found[cases, 2]["peak_mb"]
+        out["a worker's memory by a case, bytes"] = 1e6 * grown_mb / (more[-1] - cases)
+    return out
+
+
+def measure(cases: int, more: list[int], base: str | None, python: str) -> Iterator[tuple[str, Any]]:
+    """Everything, by name, as it comes."""
     with tempfile.TemporaryDirectory(prefix="hil-bench-") as name:
-        folder = Path(name)
-        found: dict[str, Any] = {"a case": one_case(folder)}
-        runs = [(cases, 1), (cases, 2), *([(10_000, 2), (100_000, 2)] if full else [])]
-        for count, workers in runs:
-            found[f"{count} cases, workers {workers}"] = whole(folder, count, workers)
-    one, two = (found[f"{cases} cases, workers {n}"]["wall_s"] for n in (1, 2))
-    return found | {
-        "one worker over two": one / two,
-        **({"simulation beside the other version's": beside_base(base)} if base else {}),
-        "motulator": beside_motulator(python, found["a case"]["case_ms"]),
-    }
+        case = one_case(Path(name))
+        yield "a case", case
+        yield "motulator", beside_motulator(python, case["case_ms"])
+        if base:
+            yield "simulation beside the other version's", beside_base(base, "simulated_tick.py", "us_a_tick")
+            yield "a case beside the other version's", beside_base(base, "swept_case.py", "ms_a_case")
+        yield from campaigns(Path(name), cases, more).items()
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.campaign", description=__doc__)
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--cases", type=int, default=4000)
-    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--cases", type=int, default=2000)
+    parser.add_argument("--full", action="store_true", help="10,000 cases, too")
+    parser.add_argument("--huge", action="store_true", help="100,000 cases, too")
     parser.add_argument("--base", metavar="PYTHON", help="an interpreter that has another version")
     parser.add_argument(
         "--motulator", default=sys.executable, metavar="PYTHON", help="an interpreter that has motulator"
     )
     args = parser.parse_args()
-    found = measure(args.cases, args.full, args.base, args.motulator) | {"machine": machine_facts()}
+    more = [10_000] * args.full + [100_000] * args.huge
+    found: dict[str, Any] = {}
+    for name, value in measure(args.cases, more, args.base, args.motulator):
+        found[name] = value
+        sys.stderr.write(f"{name}: {value}\n")  # what is measured is known, whatever ends it
+    found["machine"] = machine_facts()
     if args.json:
         sys.stdout.write(json.dumps(found, indent=2) + "\n")
         return
