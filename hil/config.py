@@ -469,11 +469,11 @@ class LimitsTable(Table):
     following_error_s: Annotated[float, Field(ge=1e-6, le=3600, allow_inf_nan=False)] = 0.1
     """How long the following error may be too large."""
     i_d_max_a: Positive | None = None
-    """|i_d|, which is held at zero, may be above this in few ticks only (CURRENT_UNCONTROLLED); left out: no
-    such limit."""
+    """|i_d - i_d*|, i_d* being 0 for most laws, may be above this in few ticks only (CURRENT_UNCONTROLLED);
+    left out: no such limit."""
     open_phase_min_a: Positive | None = None
-    """|i_d| above this and above |i_q| / 3 in most ticks is an open phase (CURRENT_UNCONTROLLED); left out:
-    not looked for."""
+    """|i_d - i_d*| above this and above |i_q| / 3 in most ticks is an open phase (CURRENT_UNCONTROLLED);
+    left out: not looked for."""
     trip_ticks: Annotated[int, Field(ge=1, le=1000)] = 3
     """Periods in a row for which a measured limit must be exceeded for the run to end."""
     guard_trip_ticks: Annotated[int, Field(ge=1, le=10**9)] = 200

@@ -126,6 +126,7 @@ SAFETY_STATE: Final = np.dtype(
         ("came", "i8"),
         ("age", "i8", 8),
         ("stale_at", "i8"),
+        ("i_d_ref", "f8"),
     ],
     align=True,
 )
@@ -133,7 +134,7 @@ SAFETY_STATE: Final = np.dtype(
 
 ``elapsed``: periods since the last measurement that was judged; ``gap``: of this tick; ``came``: slow
 messages that have come once, and MEASURED; ``age``: of each [periods]; ``stale_at``: ``stale`` when the stop
-began.
+began; ``i_d_ref``: what i_d was last to follow, which a stop leaves.
 """
 
 OVER_SPEED: Final = 0

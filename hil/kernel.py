@@ -16,6 +16,7 @@ from hil.control.jit import array_at, jit
 from hil.control.law import (
     LAW_PARAMS,
     LAW_STATE,
+    MTPA,
     SPEED,
     apply,
     ask,
@@ -101,7 +102,16 @@ def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 def note_asked(ls: Any, t: Any) -> None:
     """Write what the law asks for to the tick."""
     t["T_L_law"], t["u_q_law"], t["u_d_law"] = ls["u"][0], ls["u"][1], ls["u"][2]
-    t["i_q_ref"] = ls["i_q_ref"]
+    t["i_q_ref"], t["i_d_ref"] = ls["i_q_ref"], ls["i_d_ref"]
+
+
+@jit
+def circle(p: Any, s: Any, lp: Any, t: Any) -> float:
+    """Radius of the law's circle [V]: the guard's, or v_dc / sqrt 3 where the law follows the DC link."""
+    limit = voltage_limit(p, s)
+    if lp["kind"] == MTPA and t["v_dc"] >= 0.0:
+        limit = min(limit, t["v_dc"] / math.sqrt(3.0))
+    return float(limit)
 
 
 @jit
@@ -113,15 +123,17 @@ def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> Any:
     the flag.
     """
     if t["state"] != DriveState.OPERATION_ENABLED:
-        t["u_q_law"], t["u_d_law"], t["T_L_law"], t["i_q_ref"] = 0.0, 0.0, 0.0, 0.0
+        t["u_q_law"], t["u_d_law"], t["T_L_law"] = 0.0, 0.0, 0.0
+        t["i_q_ref"], t["i_d_ref"] = 0.0, 0.0
         return 0.0, 0.0, 0.0, 0
     if not (t["rx_flags"] & RxFlag.FRESH and ls["started"]):
         t["u_q_law"], t["u_d_law"], t["T_L_law"] = s["u_q"], s["u_d"], s["T_L"]
-        t["i_q_ref"] = ls["i_q_ref"]
+        t["i_q_ref"], t["i_d_ref"] = ls["i_q_ref"], ls["i_d_ref"]
         return s["u_q"], s["u_d"], s["T_L"], 0
-    limit = voltage_limit(p, s)
+    limit = circle(p, s, lp, t)
     ask(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], limit)
     note_asked(ls, t)
+    s["i_d_ref"] = ls["i_d_ref"]
     number = math.isfinite(ls["u"][1]) and math.isfinite(ls["u"][2])
     saturated = is_saturated(lp, ls, limit)
     to_circle(ls, limit)

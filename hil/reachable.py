@@ -1,6 +1,7 @@
 """What a configuration asks for and can't get: said before the run, and refused on a bus that may be real.
 
-The speed that a reference reaches and the voltage that it needs there, poles that the sampling can't follow,
+The speed that a reference reaches and the voltage that it needs there (with the field
+weakened, where the law does that), poles that the sampling can't follow,
 times that are no whole number of periods. The check is of the steady state without load: what fails here
 never works; what passes may still saturate under load, and the record flags that (``GuardFlag.SATURATED``).
 """
@@ -11,8 +12,12 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from hil.config import ReferenceTable, RunConfig
-from hil.design import WireFacts
+from hil.control.law import LAW_PARAMS
+from hil.control.mtpa import operating_point
+from hil.design import WireFacts, motor_model
 
 
 def out_of_reach(config: RunConfig, wire: WireFacts) -> tuple[str, ...]:
@@ -40,6 +45,33 @@ def voltage_at(config: RunConfig, w: float) -> float:
     return math.hypot(m.R_s_ohm * i_q + m.n_p * w * m.psi_f_wb, m.n_p * w * m.L_q_h * i_q)
 
 
+def is_held(config: RunConfig, w: float, u_most: float) -> bool:
+    """Whether the law mtpa holds a speed [rad/s] without load on a circle of u_most [V]: i_d within i_max."""
+    m, p = motor_model(config.motor), np.zeros(1, LAW_PARAMS)
+    own = {"k_t": m.k_t, "n_p": m.n_p, "R_s": m.R_s, "L_d": m.L_d, "L_q": m.L_q}
+    for name, value in (own | {"i_max": config.limits.i_max_a}).items():
+        p[name] = value
+    tau, u = m.B_f * w / (1.5 * m.n_p), config.controller.voltage_share * u_most
+    return not operating_point(p[0], tau, m.n_p * w, u)[2]
+
+
+def _weakened(config: RunConfig, w: float, most: float) -> Iterator[str]:
+    """Past base speed: what the current can't hold, and what the magnets do to the link without it."""
+    limits, m = config.limits, config.motor
+    if not is_held(config, w, most):
+        yield (
+            f"reference: {w:g} rad/s can't be held with {most:g} V even by a weakened field of "
+            f"{limits.i_max_a:g} A (limits.u_max_v and what the frames carry, controller.voltage_share, "
+            "limits.i_max_a); take a lower speed"
+        )
+    emf = math.sqrt(3.0) * m.n_p * m.psi_f_wb * w
+    if emf > limits.v_dc_max_v:
+        yield (
+            f"reference: at {w:g} rad/s the magnets give {emf:.4g} V between phases, and charge the DC link "
+            f"past limits.v_dc_max_v = {limits.v_dc_max_v:g} once the drive lets go; take a lower speed"
+        )
+
+
 def _speed(config: RunConfig, wire: WireFacts) -> Iterator[str]:
     limits, w = config.limits, peak(config.reference)
     if w > limits.w_max_rad_s:
@@ -48,6 +80,9 @@ def _speed(config: RunConfig, wire: WireFacts) -> Iterator[str]:
     if limits.u_max_v is None:
         return
     most, needs = min(limits.u_max_v, wire.u_top), voltage_at(config, w)
+    if config.controller.kind == "mtpa":
+        yield from _weakened(config, w, most)
+        return
     if config.controller.kind != "fac" and needs > most:
         yield (
             f"reference: {w:g} rad/s takes {needs:.4g} V without load, there are {most:g} V "

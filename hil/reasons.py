@@ -222,9 +222,10 @@ CAUSES: Final[dict[Reason, Cause]] = {
         "limits.following_error_rad_s", "rad/s",
         lambda p, s, t: abs(float(t["w_ref"]) - float(t["w"])), _limit("w_error_max"), _flags),
     Reason.CURRENT_UNCONTROLLED: Cause(
-        "i_d, which is held at zero, is large most of the time",
+        "i_d is far from its reference, 0 for most laws, most of the time",
         "look for an open phase or a wrong rotor angle",
-        "limits.i_d_max_a or open_phase_min_a", "A", lambda p, s, t: abs(float(t["i_d"])),
+        "limits.i_d_max_a or open_phase_min_a", "A",
+        lambda p, s, t: abs(float(t["i_d"]) - (0.0 if s is None else float(s["i_d_ref"]))),
         lambda p, s, t: float(min(p["i_d_max"], max(p["open_phase_min"], abs(float(t["i_q"])) / 3.0)))),
     Reason.STALE_STATUS: Cause(
         "a slow message of the drive (DC link, temperatures) stopped or never came",

@@ -166,7 +166,8 @@ class Field:
     role: Role
     doc: str
     absent: float | None = None
-    """Of an input newer than log format 1: what a log without it stands for (docs/log-format.md)."""
+    """Of an input newer than log format 1, and of an output that was a constant before: what a log without it
+    stands for (docs/log-format.md)."""
     shown: Shown = HIDDEN
 
     @property
@@ -266,6 +267,8 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(67, "T_L_hat", "f8", "N m", "output", "load torque estimate -J d_hat_w",
           shown=Shown("load", "estimate", 1, until_stop=True, live="load torque", what_if=True,
                       line="load estimate", span=0.2)),
+    Field(68, "i_d_ref", "f8", "A", "output", "d current asked for; 0 for most laws", absent=0,
+          shown=Shown("current", "i_d*", 3, False, live="current", what_if=True)),
 )  # fmt: skip
 
 

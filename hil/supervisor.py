@@ -124,15 +124,16 @@ def judge_echo(p: Any, s: Any, t: Any) -> int:
 def judge_following(p: Any, s: Any, t: Any) -> int:
     """Return the Reason once speed or i_d has been off its reference by more than allowed for too long.
 
-    i_d is held at zero. With a phase open the current stays on one stator axis, so that tan theta = i_d/i_q
-    while the rotor turns by theta: |i_d| > |i_q|/3 in 80 % of the ticks, at any load whose current the
-    sensors can tell. So periods count up and down; one measurement alone never fills the count.
+    i_d follows i_d*, 0 for most laws. With a phase open the current stays on one stator axis, so that
+    tan theta = i_d/i_q while the rotor turns by theta: |i_d| > |i_q|/3 in 80 % of the ticks, at any load
+    whose current the sensors can tell. So periods count up and down; one measurement alone never fills the
+    count.
     """
     if not t["rx_flags"] & RxFlag.FRESH:
         return Reason.NONE.value
     off = abs(t["w_ref"] - t["w"]) > p["w_error_max"]
     lost = persists(s, FOLLOWING, off, p["w_error_ticks"])
-    i_d = abs(t["i_d"])
+    i_d = abs(t["i_d"] - s["i_d_ref"])
     far = i_d > p["i_d_max"] or (i_d > p["open_phase_min"] and 3.0 * i_d > abs(t["i_q"]))
     periods = min(max(1, s["elapsed"]), max(1, p["w_error_ticks"] // 2))
     s["uncontrolled"] = s["uncontrolled"] + periods if far else max(0, s["uncontrolled"] - periods)

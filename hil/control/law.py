@@ -25,6 +25,7 @@ from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
 from hil.control.jit import jit
 from hil.control.linalg import Array, copy, matvec, matvec_add
+from hil.control.mtpa import operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
 from hil.control.speed import COMMANDS, ask_speed
@@ -38,6 +39,7 @@ FAC: Final = 1
 PI: Final = 2
 IDENTIFY: Final = 3
 SPEED: Final = 4
+MTPA: Final = 5
 ROWS: Final = 32
 """Most rows of an experiment."""
 
@@ -111,6 +113,8 @@ LAW_PARAMS: Final = np.dtype(
         ("gap_y", "f8", MAX_GAP),
         ("short", "i8", 3),
         ("first", "i8", 3),
+        ("R_s", "f8"),
+        ("u_share", "f8"),
     ],
     align=True,
 )
@@ -119,14 +123,18 @@ LAW_PARAMS: Final = np.dtype(
 takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's table (:func:`identify_law`);
 from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`); from
 ``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`); lengths of an
-adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``."""
+adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``; R_s and the share of
+the voltage circle of :func:`mtpa_law`."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
 _BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
 _INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
 _FILTER = ("order", "v_y", "v_u", "v_s", "w_y", "w_u", "w_s", "w_d", "gap_y")
-LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys((*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER), 0.0)
+_SALIENT = ("R_s", "u_share")
+LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
+    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT), 0.0
+)
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
 A log that lacks one replays with that value; a test refuses a new parameter without one (docs/log-format.md).
@@ -175,6 +183,8 @@ LAW_STATE: Final = np.dtype(
         ("still", "i8", 3),
         ("doubt", "i8", 3),
         ("x_last", "f8", 3),
+        ("i_d_ref", "f8"),
+        ("capped", "i8"),
     ],
     align=True,
 )
@@ -182,7 +192,8 @@ LAW_STATE: Final = np.dtype(
 [A, V, V], and an experiment's place in its table, voltage level [V] of q and d, peaks of w, i_q, i_d;
 of a drive's own current loop what flows, and the commands on their way, newest first; of a filtered speed
 rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
-adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still."""
+adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
+whether the torque asked for was capped."""
 
 Record = npt.NDArray[np.void]
 
@@ -540,15 +551,21 @@ def look_ahead(p: Any, s: Any) -> None:
 
 
 @jit
-def speed_law(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
-    """i_q* that moves the speed error by e^{-p_w T_s} a tick, compensates d_hat_w, limited to i_max.
+def asked_current(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
+    """i_q* that moves the speed error by e^{-p_w T_s} a tick and compensates d_hat_w.
 
     w+ = a_w w + e_w (k_t i_q / J + d);  i_q* = J / (k_t e_w) (w*+ + lam (w - w*) - a_w w - e_w d)
     """
     target = w_ref + p["T_s"] * dw_ref
     wanted = target + p["T_s"] * dw_ref + p["lam_w"] * (s["x_p"][0] - target)
     drift = p["a_w"] * s["x_p"][0] + p["e_w"] * s["d_p"][0]
-    i_q_ref = p["J"] * (wanted - drift) / (p["k_t"] * p["e_w"])
+    return float(p["J"] * (wanted - drift) / (p["k_t"] * p["e_w"]))
+
+
+@jit
+def speed_law(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
+    """:func:`asked_current`, limited to i_max."""
+    i_q_ref = asked_current(p, s, w_ref, dw_ref)
     return float(min(max(i_q_ref, -p["i_max"]), p["i_max"]))
 
 
@@ -561,13 +578,43 @@ def free_response(p: Any, s: Any) -> None:
 
 @jit
 def current_law(p: Any, s: Any) -> None:
-    """u_q, u_d that move the current errors by e^{-p_q T_s} and e^{-p_d T_s} a tick; i_d* = 0."""
+    """u_q, u_d that move the current errors by e^{-p_q T_s} and e^{-p_d T_s} a tick; i_d* = 0 here."""
     free_response(p, s)
     q_wanted = s["i_q_ref"] + p["lam_q"] * (s["x_p"][1] - s["i_q_ref"])
     d_wanted = p["lam_d"] * s["x_p"][2]
     s["u"][0] = 0.0
     s["u"][1] = (q_wanted - s["work"][1]) / p["Bd"][1, 1]
     s["u"][2] = (d_wanted - s["work"][2]) / p["Bd"][2, 2]
+
+
+@jit
+def steady_room(p: Any, s: Any, w: float, u_limit: float) -> float:
+    """Voltage [V] of the model that the next operating point may take at the electrical speed w.
+
+    u_share of the circle, less by how much the point before takes more than by the model: it takes
+    u - L d_hat, d_hat being known apart from the coupling only where that is a known term.
+    """
+    on = float(p["coupling"])
+    u_d, u_q = voltage(p, w, s["i_d_ref"], s["i_q_ref"])
+    e_d, e_q = u_d - on * p["L_d"] * s["d_hat"][2], u_q - on * p["L_q"] * s["d_hat"][1]
+    more = math.sqrt(e_d * e_d + e_q * e_q) - math.sqrt(u_d * u_d + u_q * u_q)
+    return float(max(p["u_share"] * u_limit - more, 0.0))
+
+
+@jit
+def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
+    """The cascade, whose torque is made by the least current that the voltage allows; i_d follows i_d*.
+
+    tau = psi_f i_q + (L_d - L_q) i_d i_q: the speed law's q current, and what c(x_p) has already put in for
+    the reluctance torque.
+    """
+    psi_f, w = p["k_t"] / (1.5 * p["n_p"]), p["n_p"] * s["x_p"][0]
+    reluctance = (p["L_d"] - p["L_q"]) * s["x_p"][2] * s["x_p"][1]
+    tau = psi_f * asked_current(p, s, w_ref, dw_ref) + reluctance
+    i_d_ref, i_q_ref, capped = operating_point(p, tau, w, steady_room(p, s, w, u_limit))
+    s["i_d_ref"], s["i_q_ref"], s["capped"] = i_d_ref, i_q_ref, int(capped)
+    current_law(p, s)
+    s["u"][2] += (1.0 - p["lam_d"]) * i_d_ref / p["Bd"][2, 2]
 
 
 @jit
@@ -727,6 +774,8 @@ def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: fl
         pi_law(p, s, w_ref, dw_ref, u_limit)
     elif p["kind"] == IDENTIFY:
         identify_law(p, s, w_ref)
+    elif p["kind"] == MTPA:
+        mtpa_law(p, s, w_ref, dw_ref, u_limit)
     else:
         s["i_q_ref"] = speed_law(p, s, w_ref, dw_ref)
         current_law(p, s)
@@ -734,8 +783,10 @@ def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: fl
 
 @jit
 def is_saturated(p: Any, s: Any, u_limit: float) -> bool:
-    """True when what :func:`ask` asked for is on or past a limit: the circle, i_max, T_L_max."""
+    """True when what :func:`ask` asked for is on or past a limit: the circle, i_max, the torque, T_L_max."""
     u_q, u_d = s["u"][1], s["u"][2]
     if u_q * u_q + u_d * u_d >= u_limit * u_limit or abs(s["i_q_ref"]) >= p["i_max"]:
         return True
+    if p["kind"] == MTPA:
+        return bool(s["capped"] != 0)
     return bool(p["kind"] == FAC and abs(s["u"][0]) >= p["T_L_max"])

@@ -65,6 +65,7 @@ NUMBERS: Final = (
     "seed",
     "damping",
     "share",
+    "voltage_share",
 )
 PURE: Final = frozenset((*COUNTS, *NUMBERS, "covariance", "mean"))
 """What has no unit of its own: counts, numbers of things, ratios, and what has those of other keys."""

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil.control.fac import MAX_GAP
-from hil.control.law import N_MAX, ROWS, SPEED
+from hil.control.law import MTPA, N_MAX, ROWS
 from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
@@ -21,7 +21,7 @@ COUNTERS: Final = 256
 RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
     "safety": {"counter_modulus": (1, COUNTERS), "messages": (0, MOST_MESSAGES)},
     "law": {
-        "kind": (0, SPEED),
+        "kind": (0, MTPA),
         "max_gap": (1, MAX_GAP),
         "N": (0, N_MAX - 1),
         "form": (0, ADAPTIVE),

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil.app import Overrides, Setup, load_setup
-from hil.control.law import CASCADE, FAC, PI
+from hil.control.law import CASCADE, FAC, MTPA, PI
 from hil.design import motor_model
 from hil.emulate import load_plant
 from hil.errors import HilError
@@ -30,6 +30,10 @@ def speed_drive(path: Path, overrides: Overrides) -> Setup:
     if kind == FAC:
         raise HilError(f"{path}: controller.kind fac commands the load; only speed drives can be tuned")
     if kind not in (CASCADE, PI):
+        if kind == MTPA:
+            raise HilError(
+                f"{path}: controller.kind mtpa: tune it as cascade, whose poles it has, and put them in"
+            )
         raise HilError(
             f"{path}: controller.kind {setup.config.controller.kind} asks for no voltage; only laws that do "
             "can be tuned; the margins of this one: hil check"

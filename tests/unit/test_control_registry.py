@@ -44,6 +44,7 @@ LAWS = {
     "lq": 'kind="lq", speed_weight=100.0',
     "deadbeat": 'kind="deadbeat"',
     "speed": 'kind="speed"',
+    "mtpa": 'kind="mtpa"',
 }
 
 

@@ -131,7 +131,9 @@ def evil(path: Path) -> Path:
     """A good log whose texts are markup and terminal sequences."""
     log = open_log(SIMULATED)
     run = log.metadata["run"] | {"kind": ESCAPE, "commit": ESCAPE}
-    with RunFile(path, {"metadata": run, "attachments": log.attachments | {ESCAPE: ESCAPE}}) as file:
+    with RunFile(
+        path, {"metadata": run, "attachments": log.attachments | {ESCAPE: ESCAPE}}, absent=log.absent
+    ) as file:
         file.add_ticks(log.ticks)
         file.add_event(1, 1, ESCAPE, ESCAPE)
         file.finish({"ended": ESCAPE})

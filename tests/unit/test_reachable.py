@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from hil.app import Overrides, check_reachable, load_setup, run
 from hil.check import reach_rows
 from hil.errors import ArmingError
-from hil.reachable import voltage_at
+from hil.reachable import is_held, voltage_at
 
 CASES = (
     ("reference.w_rad_s=151.0", "limits.w_max_rad_s = 150 stops it"),
@@ -27,7 +28,7 @@ CASES = (
 )
 
 
-@pytest.mark.parametrize("name", ["demo", "inverter", "paper", "can0", "vcan0"])
+@pytest.mark.parametrize("name", ["demo", "inverter", "paper", "can0", "vcan0", "salient"])
 def test_the_shipped_configurations_ask_for_nothing_out_of_reach(configs: Path, name: str) -> None:
     assert load_setup(configs / f"{name}.toml", Overrides()).warnings == ()
 
@@ -41,6 +42,36 @@ def test_what_is_out_of_reach_is_said(
     check_reachable(setup)
     assert said in capsys.readouterr().err
     assert [row.verdict for row in reach_rows(setup)] == ["warn"] * len(setup.warnings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (
+            ("reference.w_rad_s=140.0", "limits.i_max_a=9.0"),
+            "140 rad/s can't be held with 180 V even by a weakened",
+        ),
+        (("reference.w_rad_s=-140.0", "limits.i_max_a=9.0"), "field of 9 A .* take a lower speed$"),
+        (
+            ("reference.w_rad_s=120.0", "limits.v_dc_max_v=490.0"),
+            "at 120 rad/s the magnets give 498.8 V .* = 490 ",
+        ),
+        (('controller={kind="cascade"}',), "reference: 120 rad/s takes 288 V without load, there are 180 V"),
+    ],
+)
+def test_past_base_speed_what_no_weakened_field_holds_is_said(
+    configs: Path, settings: tuple[str, ...], said: str
+) -> None:
+    setup = load_setup(configs / "salient.toml", Overrides(settings=settings))
+    (line,) = setup.warnings
+    assert re.search(said, line)
+
+
+def test_the_speed_that_a_weakened_field_holds_ends_where_the_current_does(configs: Path) -> None:
+    """Without load and R_s: n_p w (psi_f - L_d i_max) = share u_max."""
+    config = load_setup(configs / "salient.toml", Overrides(settings=("motor.R_s_ohm=1e-6",))).config
+    most = 0.92 * 180.0 / (3 * (0.8 - 0.033 * 15.0))
+    assert is_held(config, 0.999 * most, 180.0) and not is_held(config, 1.001 * most, 180.0)
 
 
 def test_on_a_bus_that_may_be_real_it_is_refused(configs: Path) -> None:

@@ -53,7 +53,7 @@ def test_a_new_field_in_a_plot_there_is_and_in_one_of_its_own() -> None:
 
 def test_the_live_page_has_every_live_field() -> None:
     named = [key for _, curves in live_plots() for key, _ in curves]
-    assert sorted(named) == sorted(field.name for field in FIELDS if field.shown.live) and len(named) == 10
+    assert sorted(named) == sorted(field.name for field in FIELDS if field.shown.live) and len(named) == 11
     assert [title for title, _ in live_plots()] == [
         "speed [rad/s]", "current [A]", "command [V, or what the drive takes]",
         "load torque [N m]", "lateness [us]",
@@ -62,7 +62,16 @@ def test_the_live_page_has_every_live_field() -> None:
 
 
 def test_what_if_compares_estimates_and_what_the_law_asks_for() -> None:
-    assert set(COMPARED) == {"d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "i_q_ref", "u_q_law", "u_d_law"}
+    assert set(COMPARED) == {
+        "d_hat_w",
+        "d_hat_q",
+        "d_hat_d",
+        "T_L_hat",
+        "i_q_ref",
+        "i_d_ref",
+        "u_q_law",
+        "u_d_law",
+    }
     assert all(field.role == "output" for field in FIELDS if field.shown.what_if)
 
 

@@ -210,6 +210,13 @@ def test_a_d_current_beside_the_q_current(i_q: float, i_d: float, counts: int, s
     assert ask(judge_following, guard) == Reason.NONE and guard.s["uncontrolled"][0] == counts
 
 
+@pytest.mark.parametrize(("i_d", "counts"), [(-7.0, 0), (-7.1, 1), (-3.0, 0), (-2.9, 1), (0.0, 1)])
+def test_the_d_current_is_judged_by_its_reference(i_d: float, counts: int) -> None:
+    guard = bench(i_d_max=2.0, w_error_ticks=3)
+    guard.s["i_d_ref"], guard.t["i_d"] = -5.0, i_d
+    assert ask(judge_following, guard) == Reason.NONE and guard.s["uncontrolled"][0] == counts
+
+
 def test_the_uncontrolled_current_goes_before_the_speed() -> None:
     guard = bench(i_d_max=2.0, w_error_max=1.0, w_error_ticks=1)
     guard.t["i_d"], guard.t["w"] = 3.0, 9.0
