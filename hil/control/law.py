@@ -364,10 +364,11 @@ def _check(spec: LawSpec) -> None:
 
 def _check_takes(spec: LawSpec, law: Any) -> None:
     """Refuse a law for a drive that does not take what it asks for."""
-    if (spec.inner is None) == ("voltage" in law.takes):
+    if (spec.inner is None and "voltage" in law.takes) or (spec.inner and set(law.takes) - {"voltage"}):
         return
     takes = "voltages" if spec.inner is None else "a current or a torque"
-    fit = [one.kind for one in laws().values() if ("voltage" in one.takes) == (spec.inner is None)]
+    own = {"voltage"} if spec.inner is None else {"current", "torque"}
+    fit = [one.kind for one in laws().values() if own & set(one.takes)]
     raise ControlDesignError(
         f"controller.kind: {spec.kind} asks for {' or '.join(law.takes)}, the drive takes {takes}; "
         f"take {', '.join(fit)}"
@@ -676,6 +677,15 @@ def identify_law(p: Any, s: Any, w_ref: float) -> None:
 
 
 @jit
+def identify_speed(p: Any, s: Any, w_ref: float) -> None:
+    """:func:`identify_law` for a drive with a current loop of its own: the row's current is the command."""
+    if w_ref != p["w_run"] or abs(s["x"][0]) > p["goal"][0]:
+        s["row"] = p["rows"]
+    s["i_q_ref"] = torque_step(p, s)
+    s["u"][0], s["u"][1], s["u"][2] = 0.0, s["i_q_ref"] * p["u_i"], 0.0
+
+
+@jit
 def torque_step(p: Any, s: Any) -> float:
     """i_q* of the row, reached at its slew [A/tick]; the row ends at its speed, or after its ticks.
 
@@ -764,6 +774,9 @@ def command(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit
 @jit
 def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: float) -> None:
     """:func:`command` before the voltage circle: s['u'] is what the law asks for."""
+    if p["kind"] == SPEED and p["rows"] > 0:
+        identify_speed(p, s, w_ref)
+        return
     if p["kind"] == SPEED:
         ask_speed(p, s, w_ref, dw_ref)
         return

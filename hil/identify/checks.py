@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from hil.identify.estimate import UNITS, Parameter
 from hil.identify.plan import Step
@@ -29,7 +30,8 @@ def seen_in(step: Step, ticks: TickArray) -> Seen:
     more = (
         (f"the drive limited the voltage in {100 * limited:.0f} % of the ticks: left out",) if limited else ()
     )
-    judged = {"sensors": _rest, "standstill": _pulses, "spinning": _turns, "inertia": _turns}[step.name](
+    pulses = _pulses if step.controller.get("passes") else _currents
+    judged = {"sensors": _rest, "standstill": pulses, "spinning": _turns, "inertia": _turns}[step.name](
         step, own
     )
     return Seen(judged.faults, (*judged.findings, *more))
@@ -68,13 +70,23 @@ def _pulses(step: Step, own: TickArray) -> Seen:
     return Seen()
 
 
+def _currents(step: Step, own: TickArray) -> Seen:
+    """The current that is asked for must flow, where the drive reports it."""
+    asked, told = float(np.abs(own["i_q_ref"]).max()), np.isfinite(own["i_q"])
+    reached = float(np.abs(own["i_q"][told]).max()) if told.any() else asked
+    if reached < 0.5 * asked:
+        text = f"of {asked:.3g} A that were asked for {reached:.3g} A came"
+        return Seen((f"{text}: an open phase, no motor, no supply, or a drive that is limited",))
+    return Seen()
+
+
 def _fast(own: TickArray) -> float:
     return float(max(np.abs(own["w"]).max(), 20.0 * _noise(own)))
 
 
 def _turns(step: Step, own: TickArray) -> Seen:
     """The shaft must turn, and first the way of the torque."""
-    peak, current = float(np.abs(own["w"]).max()), float(np.abs(own["i_q"]).max())
+    peak, current = float(np.abs(own["w"]).max()), float(np.abs(_flowed(own)).max())
     first_way = float(np.sign(step.controller["q"][0]))
     wrong = step.controller["w_wrong_rad_s"]
     begun = np.flatnonzero(np.abs(own["w"]) > wrong)
@@ -87,6 +99,12 @@ def _turns(step: Step, own: TickArray) -> Seen:
     return Seen()
 
 
+def _flowed(own: TickArray) -> npt.NDArray[np.float64]:
+    """i_q, or where the drive does not report it what was asked for."""
+    out: npt.NDArray[np.float64] = np.where(np.isfinite(own["i_q"]), own["i_q"], own["i_q_ref"])
+    return out
+
+
 def breakaway(ticks: TickArray, k_t: Parameter) -> Parameter | None:
     """Torque at which a shaft begins to turn as it grows slowly: between rest and motion that is seen."""
     own = operating(ticks)
@@ -96,7 +114,7 @@ def breakaway(ticks: TickArray, k_t: Parameter) -> Parameter | None:
     at = int(np.argmax(moves))
     last = np.flatnonzero(np.abs(own["w"][:at]) <= 2.0 * _noise(own))
     before = int(last[-1]) if len(last) else 0
-    smooth = np.convolve(own["i_q"], np.ones(5) / 5.0, "same")
+    smooth = np.convolve(_flowed(own), np.ones(5) / 5.0, "same")
     rest = max(before - 2 * (at - before) - 10, 0)  # it had moved before that showed
     low, high = sorted(abs(k_t.value * float(smooth[k])) for k in (rest, at))
     return Parameter(0.5 * (low + high), low, high, UNITS["coulomb"])

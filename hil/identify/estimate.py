@@ -13,6 +13,7 @@ from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import SHORTEST, Samples, joined, samples_of, turning
 from hil.identify.fit import Fit, Shaft, fit, frozen
+from hil.identify.inner import InnerFit, evenly
 from hil.identify.model import B_F, COULOMB, L_D, L_Q, LOAD, PSI_F, R_S, Flags, J
 from hil.identify.shaft import calm, rough, times
 from hil.signals import TickArray
@@ -24,12 +25,14 @@ TOLD: Final = 0.25
 """Half-width, as a share of the value, from which on a parameter counts as not told."""
 EXACT: Final = 5e-4
 """Share of R_s, L, psi_f, J to which a model can be believed: the modulator rounds what it is sent."""
+PLAIN: Final = 0.25
+"""Share of the noise's variance by which other pole pairs must fit better: below it noise alone decides."""
 BROKEN: Final = 4.0
 """A segment is left out when its speed is so many times further off than the usual one's."""
 
 UNITS: Final = {
     "R_s": "ohm", "L_d": "H", "L_q": "H", "psi_f": "Wb", "k_t": "N m/A", "J": "kg m2", "B_f": "N m s",
-    "coulomb": "N m", "load": "N m", "delay": "ticks",
+    "coulomb": "N m", "load": "N m", "delay": "ticks", "lag": "s", "k_t_over_J": "rad/s2/A",
     "w_noise": "rad/s", "i_q_noise": "A", "i_d_noise": "A",
 }  # fmt: skip
 PLACES: Final = {
@@ -69,6 +72,11 @@ class Parameter:
         return out | {"told": self.told} | ({"why": self.why} if self.why else {})
 
 
+def known_k_t(value: float) -> Parameter:
+    """A torque constant that is believed."""
+    return Parameter(value, value, value, UNITS["k_t"])
+
+
 @dataclass(slots=True)
 class Estimate:
     """Parameters by name; ``findings``: what is odd; ``faults``: what a person must look at first.
@@ -81,7 +89,7 @@ class Estimate:
     faults: list[str] = field(default_factory=list)
     white: dict[str, float] = field(default_factory=dict)
     samples: Samples | None = None
-    fit: Fit | None = None
+    fit: Fit | InnerFit | None = None
 
     @property
     def tells(self) -> bool:
@@ -144,12 +152,7 @@ def thinned(samples: Samples) -> Samples:
     """Of very many segments some, evenly spread, turning ones and others."""
     if len(samples) == 0:
         return samples
-    first = samples.free[samples.begins]
-    keep = np.zeros(len(first), bool)
-    for kind in (first, ~first):
-        rows = np.flatnonzero(kind)
-        keep[rows[:: max(1, math.ceil(len(rows) / MOST_SEGMENTS))]] = True
-    return samples.segments(keep)
+    return evenly(samples, MOST_SEGMENTS)
 
 
 def _without_disturbed(out: Estimate, samples: Samples, guess: MotorModel) -> tuple[Samples, Shaft]:
@@ -241,7 +244,7 @@ def _at_rest(out: Estimate, samples: Samples) -> None:
 
 def _note_delay(out: Estimate, runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> None:
     """Ticks from sending a voltage to its effect: the shift under which the currents fit best."""
-    assert out.fit is not None  # noqa: S101 - called after it
+    assert isinstance(out.fit, Fit)  # noqa: S101 - called after it
     motor = _as_motor(out.fit, guess)
     cost = [_shifted(runs, T_s, out.fit, motor, d) for d in range(MOST_DELAY + 1)]
     best = int(np.argmin(cost))
@@ -272,7 +275,7 @@ def _shifted(
 
 def _note_pole_pairs(out: Estimate, guess: MotorModel) -> None:
     """n_p by the cross-coupling of the currents in a turning motor; psi_f n_p alone can't tell it."""
-    assert out.samples is not None and out.fit is not None  # noqa: S101 - called after them
+    assert out.samples is not None and isinstance(out.fit, Fit)  # noqa: S101 - called after them
     samples, found = out.samples, out.fit
     current = float(np.abs(samples.y[samples.free, 1]).max()) if samples.free.any() else 0.0
     if not out.parameters["psi_f"].told or current < 30 * float(found.sigma[1:].max()):
@@ -284,7 +287,7 @@ def _note_pole_pairs(out: Estimate, guess: MotorModel) -> None:
         motor = replace(own, n_p=n, psi_f=own.psi_f * guess.n_p / n)
         costs[n] = float(np.mean(frozen(fast, motor, found.sigma)[:, 2] ** 2))
     best = min(costs, key=lambda n: costs[n])
-    if costs[best] < 0.9 * costs[guess.n_p]:
+    if costs[best] < 0.9 * costs[guess.n_p] and costs[guess.n_p] - costs[best] > PLAIN:
         out.faults.append(f"the cross-coupling of the currents is that of {best} pole pairs, not {guess.n_p}")
 
 

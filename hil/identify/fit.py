@@ -90,6 +90,12 @@ class Problem:
             out[:, :, j] = (self.residual(x + step, weight) - here) / step[j]
         return out
 
+    @property
+    def used(self) -> int:
+        """Degrees of freedom: outputs that count, less starts and parameters."""
+        s = self.samples
+        return 2 * len(s) + int(s.free.sum()) - 3 * int(s.begins.sum()) - COUNT
+
     def solve(self, x: Array, weight: Array) -> Array:
         """Least squares, with what was known before as one more residual each."""
 
@@ -152,7 +158,7 @@ def _first_sigma(samples: Samples) -> Array:
 def _judged(one: Problem, x: Array, weight: Array) -> Fit:
     """Covariance, intervals, whiteness at the optimum."""
     r, jacobian = one.residual(x, weight), one.jacobian(x, weight)
-    cov, freedom = covariance(jacobian, r, one.samples, 1.0 / one.wide**2)
+    cov, freedom = covariance(jacobian, r, one.samples, 1.0 / one.wide**2, one.used)
     deviation = np.sqrt(np.diag(cov))
     value = one.motor(x)[:COUNT]
     half = float(student.ppf(0.5 + LEVEL / 2, freedom)) * deviation * np.where(LOGS, value, one.unit)
@@ -165,10 +171,10 @@ def _judged(one: Problem, x: Array, weight: Array) -> Fit:
     return Fit(value, half, told, residual, sigma, out, white)
 
 
-def covariance(J: Array, r: Array, samples: Samples, prior: Array) -> tuple[Array, float]:
-    """Covariance (n, n) and degrees of freedom; J (N, 3, n), r (N, 3), both weighted."""
+def covariance(J: Array, r: Array, samples: Samples, prior: Array, used: int) -> tuple[Array, float]:
+    """Covariance (n, n) and degrees of freedom; J (N, m, n), r (N, m), both weighted; ``used``: outputs less
+    starts and parameters."""
     flat = J.reshape(-1, J.shape[2])
-    used = 2 * len(samples) + int(samples.free.sum()) - 3 * int(samples.begins.sum()) - J.shape[2]
     s2 = float((r * r).sum()) / max(used, 1)
     bread = np.linalg.inv(flat.T @ flat / max(s2, 1e-30) + np.diag(prior))
     seg = samples.segment
@@ -181,8 +187,8 @@ def covariance(J: Array, r: Array, samples: Samples, prior: Array) -> tuple[Arra
 
 
 def whiteness(residual: Array, samples: Samples, lags: int = 20) -> Array:
-    """p-values (3,) of Ljung and Box over the residuals within segments: small when they correlate."""
-    out = np.ones(3)
+    """p-values (m,) of Ljung and Box over residuals (N, m) within segments: small when they correlate."""
+    out = np.ones(residual.shape[1])
     seg = samples.segment
     for c, r in enumerate(residual.T):
         spread, n = float(r @ r), len(r)

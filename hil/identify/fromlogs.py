@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from hil.config import MotorTable, RunConfig, validate
-from hil.design import motor_model
 from hil.errors import ConfigError, HilError
-from hil.identify.estimate import Estimate, estimate
+from hil.identify.estimate import Estimate
+from hil.identify.innerloop import estimate_for
 from hil.identify.motorfile import KEYS, motor_of
 from hil.log.parts import grouped
 from hil.log.reader import open_log
@@ -51,9 +51,10 @@ def read(paths: tuple[Path, ...]) -> Logged:
         config = validate(json.loads(text), RunConfig, f"{paths[0]}: config.json", None)
     except ValueError as error:
         raise HilError(f"{paths[0]}: its configuration can't be read ({error})") from error
-    if log.absent & {"ua_q", "ua_d", "w", "i_q", "i_d"}:
+    needs = {"ua_q", "ua_d", "w", "i_q", "i_d"} if config.drive.takes == "voltage" else {"u_q", "w"}
+    if log.absent & needs:
         raise HilError(f"{paths[0]}: its ticks lack what was measured or applied")
-    found = estimate([log.ticks], 1.0 / config.loop.rate_hz, motor_model(config.motor))
+    found = estimate_for(config, config.motor, [log.ticks])
     return Logged(paths[0], log.metadata.get("run", {}).get("started", ""), config, log.ticks, found)
 
 
@@ -63,7 +64,7 @@ def drift(runs: Sequence[Logged]) -> dict[str, dict[str, Any]]:
     ``drifts``: some two runs' 95 % intervals, widened by half for being many, do not meet.
     """
     out: dict[str, dict[str, Any]] = {}
-    for name in (*KEYS, "coulomb"):
+    for name in (*KEYS, "coulomb", "k_t_over_J", "lag"):
         found = [run.found.parameters[name] for run in runs if name in run.found.parameters]
         told = [p for p in found if p.told]
         if len(told) < 2:
@@ -79,15 +80,16 @@ def drift(runs: Sequence[Logged]) -> dict[str, dict[str, Any]]:
 def from_logs(paths: Sequence[Path]) -> tuple[dict[str, Any], Estimate, MotorTable, RunConfig]:
     """All runs together, each by itself, and the drift. Raises HilError."""
     runs = sorted((read(parts) for parts in grouped(paths)), key=lambda run: run.started)
-    rates, pairs = {run.config.loop.rate_hz for run in runs}, {run.config.motor.n_p for run in runs}
-    if len(rates) > 1 or len(pairs) > 1:
-        raise ConfigError(
-            "--from", ["the runs differ in loop.rate_hz or n_p; they are of no one motor and loop"]
+    kinds = {(run.config.loop.rate_hz, run.config.motor.n_p, run.config.drive.takes) for run in runs}
+    if len(kinds) > 1:
+        differ = (
+            "the runs differ in loop.rate_hz, n_p or what the drive takes; they are of no one motor and loop"
         )
+        raise ConfigError("--from", [differ])
     last = runs[-1].config
     whole = runs[0].found
     if len(runs) > 1:
-        whole = estimate([run.ticks for run in runs], 1.0 / last.loop.rate_hz, motor_model(last.motor))
+        whole = estimate_for(last, last.motor, [run.ticks for run in runs])
     result = {
         **whole.as_dict(),
         "logs": [str(run.path) for run in runs],

@@ -64,7 +64,9 @@ def _extra(found: Estimate) -> dict[str, Any]:
         out["coulomb_n_m"] = number(max(p["coulomb"].value, 0.0))
     if "w_noise" in p:
         out["w_noise_rad_s"] = number(p["w_noise"].value)
-        out["i_noise_a"] = number(math.hypot(p["i_q_noise"].value, p["i_d_noise"].value) / math.sqrt(2.0))
+    currents = [p[name].value for name in ("i_q_noise", "i_d_noise") if name in p]
+    if currents:
+        out["i_noise_a"] = number(math.hypot(*currents) / math.sqrt(len(currents)))
     if "delay" in p:
         out["delay_ticks"] = round(p["delay"].value)
     return out

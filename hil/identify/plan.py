@@ -5,6 +5,7 @@ Every step is a run like any other, by the ``identify`` law: same loop, guard, s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
@@ -12,6 +13,8 @@ from typing import Any, Final
 from pydantic import TypeAdapter
 
 from hil.config import ControllerTable, MotorTable, ObserverTable, RunConfig, StepReference
+from hil.control.speedfilter import order_of
+from hil.design import inner_loop
 from hil.errors import HilError
 
 STEPS: Final = ("sensors", "standstill", "spinning", "inertia")
@@ -56,8 +59,14 @@ def _rows(*rows: tuple[float, float, float, float, float]) -> dict[str, Any]:
 
 
 def top_speed(config: RunConfig, motor: MotorTable) -> float:
-    """Speed of the experiments [rad/s]: within w_max, and within half the voltage by the believed psi_f."""
-    by_voltage = 0.8 * config.command.most / (motor.n_p * motor.psi_f_wb)
+    """Speed of the experiments [rad/s]: within w_max, and within half the voltage by the believed psi_f.
+
+    Of a drive with a current loop of its own the voltage is that of v_dc_min_v, where there is one.
+    """
+    most = (
+        config.command.most if config.drive.takes == "voltage" else config.limits.v_dc_min_v / math.sqrt(3.0)
+    )
+    by_voltage = 0.8 * (most or math.inf) / (motor.n_p * motor.psi_f_wb)
     return SPEED_SHARE * min(config.limits.w_max_rad_s, by_voltage)
 
 
@@ -137,12 +146,76 @@ def inertia(config: RunConfig, motor: MotorTable) -> Step | Skipped:
     return Step("inertia", words, table, 4 * 2.2 + 1.5)
 
 
-MAKE: Final[dict[str, Callable[[RunConfig, MotorTable], Step | Skipped]]] = {
+def _fastest(config: RunConfig) -> float:
+    """Change of the current in a tick [A] that the guard lets pass, with room."""
+    u_i = config.drive_k_t if config.drive.takes == "torque" else 1.0
+    return 0.9 * config.command.step / u_i
+
+
+def own_sensors(config: RunConfig, motor: MotorTable) -> Step:
+    """:func:`sensors` of a drive with a current loop of its own: no current is asked for."""
+    table = _rows((0, 0, -1, 0, 0.3)) | _torque(config, motor)
+    return Step("sensors", "no current; the shaft stays where it is", table, 0.3)
+
+
+def own_standstill(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Short pulses of q current that leave no speed: the lag of the drive's loop, and the delay."""
+    T, g = 1.0 / config.loop.rate_hz, 1.5 * motor.n_p * motor.psi_f_wb / motor.J_kg_m2
+    short = max(0.005, 4 * T)
+    i = min(CURRENT_SHARE * config.limits.i_max_a, 0.1 * top_speed(config, motor) / (g * short))
+    slew, never = _fastest(config) / T, 2.0 * config.limits.w_max_rad_s
+    rows = []
+    for share in (1.0, -1.0, 0.7, -0.5):
+        rows += [(s * share * i, 0, s * share * never, slew, n * short) for s, n in ((1, 1), (-1, 2), (1, 1))]
+        rows += [(0, 0, -1, slew, 8 * short)]
+    words = f"short pulses of current up to {i:.3g} A; the shaft trembles"
+    return Step("standstill", words, _rows(*rows) | _torque(config, motor), 4 * 12 * short + 0.1)
+
+
+def own_spinning(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """:func:`spinning`, at whose end no step is faster than the guard lets pass."""
+    step = spinning(config, motor)
+    assert isinstance(step, Step)  # noqa: S101 - what it skips is decided before
+    slew = step.controller["slew_a_s"][0]
+    most = _fastest(config) * config.loop.rate_hz
+    brake = min(step.controller["i_brake_a"], _fastest(config))
+    table = step.controller | {"slew_a_s": [min(slew, most), most], "i_brake_a": brake}
+    return Step(step.name, step.words, table, step.seconds)
+
+
+def own_inertia(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """:func:`inertia` with pulses at speed, that tell lag and delay by the speed alone."""
+    w, most = top_speed(config, motor), CURRENT_SHARE * config.limits.i_max_a
+    k_t = 1.5 * motor.n_p * motor.psi_f_wb
+    i = min(max(motor.J_kg_m2 * w / (0.3 * k_t), 0.2 * most), most)
+    slew, short = _fastest(config) * config.loop.rate_hz, max(0.01, 8.0 / config.loop.rate_hz)
+    never = 2.0 * config.limits.w_max_rad_s
+    rows: list[tuple[float, float, float, float, float]] = []
+    for share in (1.0, -1.0, 0.6, -0.6):
+        q, way = share * i, math.copysign(1.0, share)
+        rows.append((q, 0, way * w, slew, 1.5))
+        rows += [(s * q, 0, s * way * never, slew, n * short) for s, n in ((-0.8, 1), (0.8, 1), (-0.8, 2))]
+        rows.append((0, 0, 0.15 * w, slew, 0.7))
+    brake = min(0.5 * i, _fastest(config))
+    words = f"run-up to {w:.3g} rad/s and run-down, in both directions, with up to {i:.3g} A"
+    table = _rows(*rows) | _torque(config, motor) | {"i_brake_a": brake}
+    return Step("inertia", words, table, 4 * (2.2 + 4 * short) + 1.5)
+
+
+Maker = Callable[[RunConfig, MotorTable], Step | Skipped]
+MAKE: Final[dict[str, Maker]] = {
     "sensors": sensors,
     "standstill": standstill,
     "spinning": spinning,
     "inertia": inertia,
 }
+OWN_LOOP: Final[dict[str, Maker]] = {
+    "sensors": own_sensors,
+    "standstill": own_standstill,
+    "spinning": own_spinning,
+    "inertia": own_inertia,
+}
+"""The same of a drive that takes a current or a torque."""
 
 
 def make(name: str, config: RunConfig, motor: MotorTable) -> Step | Skipped:
@@ -155,7 +228,7 @@ def make(name: str, config: RunConfig, motor: MotorTable) -> Step | Skipped:
         excess = (CURRENT_SHARE * limits.i_max_a) ** 2 - continuous**2
         if 6.0 * excess > limits.i2t_max_a2s:
             return Skipped(name, f"i2t_max_a2s = {limits.i2t_max_a2s:g} allows no run-up of 6 s")
-    return MAKE[name](config, motor)
+    return (MAKE if config.drive.takes == "voltage" else OWN_LOOP)[name](config, motor)
 
 
 def _still(config: RunConfig) -> float:
@@ -167,19 +240,22 @@ def config_of(config: RunConfig, step: Step, motor: MotorTable, log_name: str) -
 
     following_error_rad_s, and where i_d is driven i_d_max_a and open_phase_min_a. All other limits stay.
     """
+    own_loop = config.drive.takes != "voltage"
     turns = step.controller.get("passes", 0.0) == 0.0
     w_run = top_speed(config, motor) if turns else 1e-3
     adapter: Any = TypeAdapter(ControllerTable)
     controller = adapter.validate_python({"kind": "identify", "w_run_rad_s": w_run, **step.controller})
     D = 15e3 / config.loop.rate_hz  # ms: 15 ticks
-    window = {"kind": "ftdob", "gamma_1_rad_s": 300.0 / D, "gamma_2_rad_s": 700.0 / D, "delay_ms": D}
+    longer = D + order_of(inner_loop(config)) * 1e3 / config.loop.rate_hz
+    window = {"kind": "ftdob", "gamma_1_rad_s": 300.0 / D, "gamma_2_rad_s": 700.0 / D, "delay_ms": longer}
+    observer = {"speed": window} if own_loop else {"speed": window, "current": window}
     dropped: dict[str, Any] = {"following_error_rad_s": None}
     if not turns:
         dropped |= {"i_d_max_a": None, "open_phase_min_a": None}
     changes = {
         "motor": motor,
         "controller": controller,
-        "observer": ObserverTable.model_validate({"speed": window, "current": window}),
+        "observer": ObserverTable.model_validate(observer),
         "limits": config.limits.model_copy(update=dropped),
         "reference": StepReference(kind="step", w_rad_s=w_run),
         "loop": config.loop.model_copy(update={"duration_s": step.seconds + 0.2, "shadow": False}),

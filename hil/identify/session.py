@@ -12,10 +12,10 @@ from typing import Any, Final
 from hil.app import RunResult, Setup, run, setup_of
 from hil.config import MotorTable, RunConfig
 from hil.control.errors import ControlDesignError
-from hil.design import motor_model
 from hil.errors import ConfigError, HilError
 from hil.identify.checks import breakaway, seen_in
-from hil.identify.estimate import Estimate, estimate
+from hil.identify.estimate import Estimate, known_k_t
+from hil.identify.innerloop import estimate_for
 from hil.identify.motorfile import motor_of, toml_of
 from hil.identify.plan import Skipped, Step, config_of, make
 from hil.log.reader import open_log
@@ -25,7 +25,6 @@ from hil.signals import Reason, TickArray
 Say = Callable[[str], None]
 UNFIT: Final = {
     "fac": "commands the load machine; take a speed drive's law, cascade",
-    "speed": "is for a drive that takes a current or a torque; hil identify needs one that takes voltages",
 }
 """Laws whose drives can't be identified, and why."""
 
@@ -57,8 +56,7 @@ class Session:
         self.runs.append(ticks)
         if seen.faults:
             return
-        T_s = 1.0 / self.config.loop.rate_hz
-        self.estimate = estimate(self.runs, T_s, motor_model(self.motor))
+        self.estimate = estimate_for(self.config, self.motor, self.runs)
         self.faults += self.estimate.faults
         self.motor = motor_of(self.estimate, self.motor)
 
@@ -157,6 +155,8 @@ def _note_breakaway(session: Session) -> None:
     """Torque at which the shaft began to turn, from the step in which torque grows slowly."""
     ran = [row["step"] for row in session.steps if row.get("log")]
     k_t = session.estimate.parameters.get("k_t")
+    if session.config.drive.takes != "voltage":
+        k_t = known_k_t(session.config.k_t)
     if "spinning" in ran and k_t is not None and ran.index("spinning") < len(session.runs):
         found = breakaway(session.runs[ran.index("spinning")], k_t)
         if found is not None:

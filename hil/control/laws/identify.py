@@ -1,7 +1,8 @@
 """An experiment instead of a control law, by a table: what ``hil identify`` runs (:mod:`hil.identify`).
 
 With ``passes`` the rows are voltages in units of a level that grows from pass to pass until the currents
-reach their goals; without it they are q currents, each up to a speed or for a time.
+reach their goals; without it they are q currents, each up to a speed or for a time. A drive with a current
+loop of its own is commanded those currents, by the kernels of the law ``speed``.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from hil.control.errors import ControlDesignError
-from hil.control.law import ROWS
+from hil.control.law import ROWS, SPEED
+from hil.control.laws.speed import MEMBER as OWN_LOOP
 from hil.control.linalg import exp
 from hil.control.registry import Key, Law, Plan, Values
 
@@ -25,6 +27,10 @@ def _numbers(doc: str, least: float | None = None, unit: str = "") -> Key:
 
 def design(values: Values, plan: Plan) -> dict[str, Any]:
     """The table in ticks, and the current controller's factor. Raises ControlDesignError."""
+    if plan.inner is not None and values["passes"]:
+        raise ControlDesignError(
+            "controller.passes: the drive takes no voltages; its rows are currents, 0 passes"
+        )
     rows = len(values["q"])
     if any(len(values[name]) != rows for name in _TABLES):
         raise ControlDesignError(f"controller: {', '.join(_TABLES)} must have one entry a row, {rows} as q")
@@ -39,7 +45,8 @@ def design(values: Values, plan: Plan) -> dict[str, Any]:
     single = {"u_start": "u_start_v", "u_most": "u_most_v", "w_run": "w_run_rad_s"}
     single |= {"w_wrong": "w_wrong_rad_s", "i_brake": "i_brake_a"}
     named = {field: values[name] for field, name in single.items()}
-    return out | named | {"lam_q": lam, "lam_d": lam, "goal": goal}
+    own = {} if plan.inner is None else OWN_LOOP.design({"speed_pole_rad_s": 1.0}, plan) | {"kind": SPEED}
+    return out | named | {"lam_q": lam, "lam_d": lam, "goal": goal} | own
 
 
 MEMBER = Law(
@@ -64,4 +71,5 @@ MEMBER = Law(
         "i_brake_a": Key("current that brings the shaft to rest", 0.0, above=None, least=0.0),
         "current_pole_rad_s": Key("pole of the current errors", 250.0),
     },
+    ("voltage", "current", "torque"),
 )
