@@ -9,7 +9,7 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/closed_loop/test_current_drive.py
 NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.23.0 \
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
-COVER := --cov=hil.control --cov=hil.supervisor --cov=hil.guard --cov=hil.kernel --cov=drivers.codec --cov=drivers.e2e
+COVER := --cov=hil.control --cov=hil.tick.supervisor --cov=hil.tick.guard --cov=hil.tick.kernel --cov=drivers.codec --cov=drivers.e2e
 
 .PHONY: docs golden reference gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
 

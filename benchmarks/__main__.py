@@ -13,12 +13,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from hil.app import Overrides
 from hil.bench.machine import machine_facts
 from hil.bench.measure import QUICK, Length, simulate_speed
 from hil.bench.processes import Stand, bare_run, hil_run, metered_run, stand
-from hil.shipped import find_config
-from hil.view import key_values, show
+from hil.config.shipped import find_config
+from hil.report.view import key_values, show
+from hil.runtime.setup import Overrides
 
 HERE = Path(__file__).resolve().parent
 LIMIT_S = 120

@@ -23,16 +23,16 @@ from typing import Any, Final
 import numpy as np
 from rich.table import Table
 
-from hil.app import Overrides, Setup, load_setup
+from hil.config.design import law_spec
+from hil.config.shipped import find_config
 from hil.control.law import new_law_state
-from hil.design import law_spec
-from hil.shipped import find_config
-from hil.simulate import simulate_ticks
+from hil.report.view import show
+from hil.runtime.setup import Overrides, Setup, load_setup
+from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, speed_drive
 from hil.tuning.families import Tables, family, settings_of, toml
 from hil.tuning.loop import count_alarms
 from hil.tuning.optimise import Limits, law_of, tune
-from hil.view import show
 
 MS, MS_WORST = 1.6, 2.2
 LAWS: Final = (("adaptive", 12.0), ("cubic", 12.0), ("ftdob", 100.0), ("cubic", 100.0), ("pi", 100.0))

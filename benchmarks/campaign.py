@@ -36,16 +36,16 @@ import numpy as np
 import psutil
 
 from benchmarks.__main__ import HERE, peer
-from hil.app import Overrides, load_setup
 from hil.bench.machine import machine_facts
 from hil.campaign.case import job_of
 from hil.campaign.plan import read_plan
 from hil.campaign.run import campaign
+from hil.config.shipped import find_config
 from hil.report.segments import Responses
 from hil.report.statistics import Totals
-from hil.shipped import find_config
-from hil.simulate import simulate_ticks
-from hil.view import key_values, show
+from hil.report.view import key_values, show
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate_ticks
 
 REPEATS, TURNS, CASE_S = 40, 3, 6.0
 LOOK_S = 0.5

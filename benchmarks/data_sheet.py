@@ -23,16 +23,16 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.motors import MOTORS, NAMES, WRONG, Array, bench, plant, settings
-from hil.app import Overrides, load_setup
-from hil.config import override, read_toml
+from hil.config.tables import override, read_toml
 from hil.errors import HilError
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, motor_toml, planned, setup_for
 from hil.identify.tune import at_motor, tune, written
-from hil.metrics import operating
-from hil.simulate import simulate_ticks
+from hil.report.metrics import operating
+from hil.report.view import show
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate_ticks
 from hil.tuning.design import Wish
-from hil.view import show
 
 OFF: Final = 0.3
 WITHIN: Final = 0.15

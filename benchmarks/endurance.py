@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from hil.app import Overrides
 from hil.bench.histogram import Histogram
 from hil.bench.machine import machine_facts
 from hil.bench.measure import phases
 from hil.bench.processes import LoopRun, hil_run, stand
-from hil.shipped import find_config
-from hil.view import key_values, show
+from hil.config.shipped import find_config
+from hil.report.view import key_values, show
+from hil.runtime.setup import Overrides
 
 GROWTH_KIB = 512
 """Pages that the allocator still touches for the first time; one float a tick would be 9,000 KiB."""

@@ -24,13 +24,13 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
-from hil.convert.export import FORMATS
+from hil.config.shipped import find_config
+from hil.exchange.export import FORMATS
 from hil.log.mcapfile import RunFile
 from hil.log.reader import new_log, read_blocks
 from hil.log.schema import FRAME, Records
-from hil.shipped import find_config
+from hil.report.view import show
 from hil.signals import TickArray
-from hil.view import show
 
 FRAMES = ((0x080, 0, 1), (0x181, 1, 8), (0x201, 0, 8))  # identifier, received, bytes
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hil.config import RunConfig, load_toml
-from hil.shipped import find_config
+from hil.config.shipped import find_config
+from hil.config.tables import RunConfig, load_toml
 
 Array = npt.NDArray[np.float64]
 NAMES = ("R_s", "L_d", "L_q", "psi_f", "n_p", "J", "B_f", "coulomb", "i_max", "u_max", "w_max")

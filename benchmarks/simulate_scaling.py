@@ -18,11 +18,11 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from hil.app import Overrides, load_setup
 from hil.bench.machine import machine_facts
-from hil.shipped import find_config
-from hil.simulate import make_simulation
-from hil.view import key_values, show
+from hil.config.shipped import find_config
+from hil.report.view import key_values, show
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import make_simulation
 
 REPEATS = 3
 CASE_S = 2.0

@@ -21,8 +21,8 @@ def main() -> None:
     """Simulate and say how long a tick took."""
     os.environ.pop("NUMBA_CACHE_DIR", None)  # each version keeps its kernels in its own tree
     import hil
-    from hil.app import Overrides, load_setup
-    from hil.simulate import make_simulation
+    from hil.runtime.setup import Overrides, load_setup
+    from hil.sim.simulate import make_simulation
 
     demo = Path(hil.__file__).resolve().parents[1] / "configs" / "demo.toml"
     config = Path(sys.argv[1]) if len(sys.argv) > 1 else demo

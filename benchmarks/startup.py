@@ -17,11 +17,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from hil.app import Overrides
 from hil.bench.machine import machine_facts
 from hil.bench.processes import Stand, hil_run, stand
-from hil.shipped import find_config
-from hil.view import key_values, show
+from hil.config.shipped import find_config
+from hil.report.view import key_values, show
+from hil.runtime.setup import Overrides
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "python -c pass": ("-c", "pass"),

@@ -36,8 +36,8 @@ def of_campaign(config: Path, folder: Path) -> Callable[[int], Any]:
 
 def of_sweep(config: Path) -> Callable[[int], Any]:
     """A case of the sweep that was there before campaigns."""
-    import hil.sweep
-    from hil.app import Overrides
+    import hil.campaign.sweep
+    from hil.runtime.setup import Overrides
 
     sweep: Any = hil.sweep
     overrides = Overrides(settings=(f"loop.duration_s={SECONDS}",))

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from websockets.asyncio.client import connect
 
-from hil.app import Overrides
-from hil.demo import emulator_process
+from hil.runtime.registry import WatchError, choose
+from hil.runtime.setup import Overrides
+from hil.sim.demo import emulator_process
 from hil.watch.look import Look
-from hil.watch.registry import WatchError, choose
 
 VIEWERS = 5
 CONFIG = Path(__file__).resolve().parent.parent / "configs" / "demo.toml"

@@ -65,7 +65,7 @@ def __dir__() -> list[str]:
 
 
 class _Called(ModuleType):
-    """A room of this package that is called as the public function of its name, as ``hil.simulate``."""
+    """A room of this package that is called as the public function of its name, as ``hil.replay``."""
 
     def __call__(self, *args: Any, **options: Any) -> Any:
         """The public function."""

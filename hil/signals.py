@@ -53,7 +53,7 @@ class Request(IntEnum):
     NONE = 0
     ARM = 1
     RAMP_DOWN = 2
-    """A stop that was asked for, while the reference still ramps to 0: see :mod:`hil.setpoint`."""
+    """A stop that was asked for, while the reference still ramps to 0: see :mod:`hil.tick.setpoint`."""
     STOP = 3
     QUICK_STOP = 4
 

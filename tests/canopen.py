@@ -18,8 +18,8 @@ from drivers.bus import BusSettings, Link, open_link
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
-from hil.config import RunConfig, load_toml
-from hil.configure import Job, job_of
+from hil.config.tables import RunConfig, load_toml
+from hil.runtime.configure import Job, job_of
 from tests.conftest import CONFIGS, ROOT
 
 NODE = 5

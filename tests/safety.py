@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hil.guard import SAFETY_PARAMS, guard_command
-from hil.kernel import new_safety_state
 from hil.signals import DriveState, RxFlag, new_ticks
+from hil.tick.guard import SAFETY_PARAMS, guard_command
+from hil.tick.kernel import new_safety_state
 
 VALUES: dict[str, float] = {
     "T_s": 1e-3, "w_max": 150.0, "i_trip": 22.0, "u_max": 300.0, "du_max": 50.0, "T_L_max": 10.0,

@@ -26,12 +26,12 @@ sys.path.insert(0, str(ROOT))
 from rich.console import Console, RenderableType  # noqa: E402 - the project's folder must be on the path first
 from rich.text import Text  # noqa: E402
 
-from hil.app import Overrides  # noqa: E402
-from hil.demo import emulator_process  # noqa: E402
-from hil.shipped import find_config  # noqa: E402
-from hil.view import demo_table  # noqa: E402
+from hil.config.shipped import find_config  # noqa: E402
+from hil.report.view import demo_table  # noqa: E402
+from hil.runtime.registry import WatchError, choose  # noqa: E402
+from hil.runtime.setup import Overrides  # noqa: E402
+from hil.sim.demo import emulator_process  # noqa: E402
 from hil.watch.look import Look  # noqa: E402
-from hil.watch.registry import WatchError, choose  # noqa: E402
 from hil.watch.terminal import frame  # noqa: E402
 from tests.browser.chromium import Browser, Page, chromium  # noqa: E402
 

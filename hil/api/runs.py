@@ -10,18 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from hil import app
 from hil.api.setups import File, Settings, overrides, setup_of, texts
-from hil.app import Setup
-from hil.demo import emulator_process, own_channel
 from hil.log.check import seal
 from hil.log.reader import Log, open_log
 from hil.log.schema import meanings, units
-from hil.reasons import explain
 from hil.replay import Verdict, replay_log
+from hil.runtime.header import header_of
+from hil.runtime.session import run as run_setup
+from hil.runtime.setup import Setup
+from hil.runtime.setup import setup_of as setup_from
 from hil.signals import Reason
-from hil.simulate import make_simulation
-from hil.simulate import simulate as simulated
+from hil.sim.demo import emulator_process, own_channel
+from hil.sim.simulate import make_simulation
+from hil.sim.simulate import simulate as simulated
+from hil.tick.reasons import explain
 
 
 def simulate(
@@ -51,7 +53,7 @@ def simulate(
 
 def _in_memory(setup: Setup, ticks: Any, result: dict[str, Any]) -> Log:
     """The log that the run would have written, without a file."""
-    header = app.header_of(setup, "simulate", "lockstep")
+    header = header_of(setup, "simulate", "lockstep")
     run = {str(key): str(value) for key, value in header["metadata"].items()}
     about = {"run": run, "units": units(), "meanings": meanings(), "result": {"result": json.dumps(result)}}
     path, kept, last = setup.path.with_suffix(".mcap"), header["attachments"], int(ticks["t_ns"][-1])
@@ -67,16 +69,16 @@ def run(config: Setup | File, settings: Settings = (), *, arm: bool = False, emu
     """
     setup = setup_of(config, settings)
     if not emulated:
-        return open_log(Path(app.run(setup, arm=arm).log))
+        return open_log(Path(run_setup(setup, arm=arm).log))
     setup = _apart(setup)
     with emulator(setup):
-        return open_log(Path(app.run(setup).log))
+        return open_log(Path(run_setup(setup).log))
 
 
 def _apart(setup: Setup) -> Setup:
     """The same on a channel of the embedded bus that nobody else has."""
     bus = setup.config.bus.model_copy(update={"interface": "hil-local", "channel": own_channel("hil")})
-    return app.setup_of(setup.path, setup.config.model_copy(update={"bus": bus}))
+    return setup_from(setup.path, setup.config.model_copy(update={"bus": bus}))
 
 
 @contextlib.contextmanager

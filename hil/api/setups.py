@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from hil.app import Overrides, Setup, load_setup
 from hil.errors import HilError
 from hil.faults.matrix import inline
+from hil.runtime.setup import Overrides, Setup, load_setup
 
 Settings = Mapping[str, Any] | Iterable[str]
 """``{"loop.duration_s": 2.0}`` or ``["loop.duration_s=2.0"]``, as ``--set`` takes them."""

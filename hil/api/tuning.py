@@ -9,10 +9,10 @@ from typing import Any
 
 from hil.api.setups import File, Settings, overrides, texts
 from hil.campaign.plan import PLANT
+from hil.campaign.sweep import job_of_sweep
+from hil.campaign.sweep import sweep as swept
 from hil.errors import HilError
 from hil.faults.matrix import inline
-from hil.sweep import job_of_sweep
-from hil.sweep import sweep as swept
 from hil.tuning import compare as comparing
 from hil.tuning import design as designing
 from hil.tuning.families import DEFAULT_LAWS, settings_of

@@ -10,7 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.app import Overrides, load_setup
 from hil.bench.cyclictest import Anchor, cyclictest
 from hil.bench.histogram import Histogram
 from hil.bench.machine import machine_facts
@@ -26,10 +25,11 @@ from hil.bench.processes import (
     seconds_in_time,
     stand,
 )
-from hil.clock import RealClock
 from hil.replay import replay
+from hil.runtime.clock import RealClock
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import TickArray
-from hil.simulate import simulate
+from hil.sim.simulate import simulate
 
 GOOD: Final = 0.999
 METERED_S: Final = 5.0

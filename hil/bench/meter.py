@@ -3,8 +3,8 @@
     python -m hil.bench.meter REPORT run CONFIG ...   # as `hil run CONFIG ...`; REPORT gets a JSON object
 
 The stamps of a log say when a phase ended, waiting included; this says what it took of the processor: the
-compiled tick reads the thread's own clock at each border of :data:`hil.fused.PHASES`. What a reading takes is
-measured first and taken off.
+compiled tick reads the thread's own clock at each border of :data:`hil.runtime.fused.PHASES`. What a
+reading takes is measured first and taken off.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ import time
 from functools import partial
 from pathlib import Path
 
-from hil import fused
 from hil.errors import HilError
-from hil.fused import LAST, PHASES, Marks, mark_often, new_marks
-from hil.loop import Loop, Outcome
+from hil.runtime import fused
+from hil.runtime.fused import LAST, PHASES, Marks, mark_often, new_marks
+from hil.runtime.loop import Loop, Outcome
 
 READINGS = 5000
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
+from hil.config.design import Machine
 from hil.control.jit import jit
-from hil.design import Machine
-from hil.guard import guard_command
 from hil.signals import DriveState, new_ticks
+from hil.tick.guard import guard_command
 
 BATCHES = 8
 """The quickest counts: what else the machine does only ever adds."""

@@ -17,13 +17,15 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from hil.app import Overrides, Setup, compile_kernels, is_emulated_bus, load_setup
 from hil.bench.machine import resident_kib
-from hil.clock import RealClock
-from hil.demo import emulator_process
 from hil.errors import HilError
 from hil.log.reader import open_log
+from hil.runtime.bus import is_emulated_bus
+from hil.runtime.clock import RealClock
+from hil.runtime.session import compile_kernels
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import RxFlag, TickArray
+from hil.sim.demo import emulator_process
 
 SLACK_S: Final = 60.0
 SETTLED_S: Final = 1.0

@@ -19,19 +19,19 @@ from drivers.codec import Database
 from drivers.errors import DriverError
 from firmware_model.config import PlantConfig, Wire
 from firmware_model.node import wire_of
-from hil.app import Setup, setup_of
 from hil.campaign.figures import KEYS, Judged
 from hil.campaign.margins import design_margins
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
-from hil.columns import Columns
-from hil.config import RunConfig, override, put, read_toml, validate
+from hil.config.tables import RunConfig, override, put, read_toml, validate
 from hil.control.errors import ControlDesignError
 from hil.control.law import exact_after
 from hil.errors import ConfigError, HilError
-from hil.reasons import explain
 from hil.report.criteria import demanded
+from hil.runtime.setup import Setup, setup_of
 from hil.signals import Reason
-from hil.simulate import Simulation, simulation_of
+from hil.sim.columns import Columns
+from hil.sim.simulate import Simulation, simulation_of
+from hil.tick.reasons import explain
 
 REFUSALS: Final = (HilError, DriverError, ControlDesignError)
 SETUPS: Final = 64

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 from hil.campaign.identity import Identity, differences, identity
-from hil.clock import RealClock
 from hil.errors import HilError
+from hil.runtime.clock import RealClock
 
 Row = dict[str, Any]
 Span = tuple[int, int]

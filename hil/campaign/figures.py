@@ -15,14 +15,14 @@ from typing import Any, Final, cast
 import numpy as np
 
 from hil.campaign.margins import DESIGN
-from hil.columns import Columns
-from hil.config import LimitsTable, RunConfig
+from hil.config.tables import LimitsTable, RunConfig
 from hil.report.criteria import FIGURES, check_limit, demanded
 from hil.report.curves import F8
 from hil.report.excursions import Excursions
 from hil.report.segments import Responses, largest
 from hil.report.statistics import Phases, Totals, usual_step
 from hil.signals import DriveState, Reason
+from hil.sim.columns import Columns
 
 EXTRA: Final = {
     "w_peak_rad_s": "largest |w|, rad/s",

@@ -17,12 +17,12 @@ from hil.campaign import engine, store
 from hil.campaign.engine import Rate, Row, Workers
 from hil.campaign.run import Seen
 from hil.campaign.store import Folder, Schema
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.errors import HilError
 from hil.log.parts import grouped
+from hil.replay.whatif import COMPARED, what_if
 from hil.report.collect import collect
 from hil.report.criteria import FIGURES, figures, judge
-from hil.whatif import COMPARED, what_if
 
 LOGS_A_BATCH: Final = 8
 ALONE: Final = 16

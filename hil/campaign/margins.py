@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 
-from hil.app import Setup
+from hil.config.design import motor_model
 from hil.control.law import CASCADE, LAW_PARAMS, PI, MotorModel
-from hil.design import motor_model
+from hil.runtime.setup import Setup
 from hil.tuning.loop import rigid
 from hil.tuning.measure import Bench, loops, margins
 

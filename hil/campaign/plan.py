@@ -23,7 +23,7 @@ from scipy.stats import qmc
 
 from hil.campaign.normal import normal, root
 from hil.campaign.values import FORMS, NAMES, Distribution, corners, distribution, number
-from hil.config import Table, read_toml, validate
+from hil.config.tables import Table, read_toml, validate
 from hil.errors import ConfigError
 
 PLANT: Final = "plant:"

@@ -19,7 +19,7 @@ from hil.campaign.page import page
 from hil.campaign.plan import PlanTable, read_plan
 from hil.campaign.store import Folder, Schema, kind_of
 from hil.errors import HilError
-from hil.outputs import output_file
+from hil.log.outputs import output_file
 
 BATCH_TICKS: Final = 700_000
 """Ticks of a batch: about half a second of a core; what a lost worker takes along."""

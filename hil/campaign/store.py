@@ -21,8 +21,8 @@ import numpy.typing as npt
 from hil.campaign.engine import MISSING, Row, Span
 from hil.campaign.identity import Identity, differences, identity
 from hil.campaign.values import toml
-from hil.clock import RealClock
 from hil.errors import HilError
+from hil.runtime.clock import RealClock
 
 Kind = Literal["i8", "f8", "bool", "text"]
 Schema = dict[str, Kind]

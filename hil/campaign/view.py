@@ -10,7 +10,7 @@ from rich.table import Table
 from hil.campaign.engine import Row
 from hil.campaign.summary import name_of
 from hil.report.criteria import number
-from hil.view import key_values
+from hil.report.view import key_values
 
 
 def compare_tables(found: dict[str, Any]) -> list[Table]:

@@ -48,8 +48,8 @@ def named(table: object) -> list[str]:
 
 def cmd_init(args: argparse.Namespace) -> int:
     """Copy; nothing that is there is touched."""
+    from hil.config.shipped import find_shipped
     from hil.errors import HilError
-    from hil.shipped import find_shipped
 
     folder: Path = args.folder
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import Commands, bus_flags, overrides, print_json, say
-from hil.outputs import output_folder
+from hil.log.outputs import output_folder
 
 
 def register(commands: Commands) -> None:
@@ -33,8 +33,8 @@ def cmd_bench(args: argparse.Namespace) -> int:
     from hil.bench.measure import FULL, QUICK, bench
     from hil.bench.page import write
     from hil.bench.view import ratio_rows, ratios, read_result, rows
-    from hil.shipped import find_config
-    from hil.view import key_values, show
+    from hil.config.shipped import find_config
+    from hil.report.view import key_values, show
 
     earlier = read_result(args.compare) if args.compare else None
     out = output_folder(args.output, "lateness.png", "bench.html") if args.output else None

@@ -75,7 +75,7 @@ def cmd_campaign(args: argparse.Namespace) -> int:
 
 def _dry_run(args: argparse.Namespace) -> int:
     from hil.campaign.run import dry_run
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     found = dry_run(args.what[0], args.workers)
     if args.json:
@@ -93,7 +93,7 @@ def _dry_run(args: argparse.Namespace) -> int:
 
 def _case(args: argparse.Namespace) -> int:
     from hil.campaign.run import one_case
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     row = one_case(args.what[0], args.case)
     if args.json:
@@ -105,7 +105,7 @@ def _case(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     from hil.campaign.run import campaign
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     folder = args.output or args.what[0].with_suffix("")
     options: dict[str, Any] = {"workers": args.workers, "scheduler": args.scheduler, "resume": args.resume}
@@ -123,7 +123,7 @@ def _compare(args: argparse.Namespace) -> int:
     from hil.campaign.compare import compare
     from hil.campaign.view import compare_tables
     from hil.errors import HilError
-    from hil.view import show
+    from hil.report.view import show
 
     if len(args.what) != 2:
         raise HilError("--compare takes two folders, that of before and that of after")
@@ -139,7 +139,7 @@ def _compare(args: argparse.Namespace) -> int:
 def _what_if(args: argparse.Namespace) -> int:
     from hil.campaign.fleet import counts, fleet
     from hil.campaign.view import what_if_table
-    from hil.view import show
+    from hil.report.view import show
 
     options: dict[str, Any] = {"workers": args.workers, "scheduler": args.scheduler, "resume": args.resume}
     with progress("logs") as seen:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from hil.errors import plain
 
 if TYPE_CHECKING:
-    from hil.app import Overrides
+    from hil.runtime.setup import Overrides
 
 EXIT_FAILED, EXIT_REFUSED = 1, 2
 Run = Callable[[argparse.Namespace], int]
@@ -69,7 +69,7 @@ def bus_flags(parser: argparse.ArgumentParser) -> None:
 
 def overrides(args: argparse.Namespace) -> Overrides:
     """Overrides from the flags of a command."""
-    from hil.app import Overrides
+    from hil.runtime.setup import Overrides
 
     settings = list(args.set)
     if getattr(args, "lockstep", False):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json
 
 if TYPE_CHECKING:
-    from hil.configure import Result
+    from hil.runtime.configure import Result
 
 
 def register(commands: Commands) -> None:
@@ -29,9 +29,9 @@ def register(commands: Commands) -> None:
 def cmd_configure(args: argparse.Namespace) -> int:
     """Set a node up, or only compare."""
     with lean_imports():
-        from hil.app import bus_settings
-        from hil.configure import compare, configure, job_of
-    from hil.config import RunConfig, load_toml
+        from hil.runtime.bus import bus_settings
+        from hil.runtime.configure import compare, configure, job_of
+    from hil.config.tables import RunConfig, load_toml
     from hil.errors import HilError
 
     if args.check and (args.store or args.dbc):
@@ -50,7 +50,7 @@ def _show(result: Result, only_compared: bool) -> None:
     """Two tables: every object, and what the drive is."""
     from rich.table import Table
 
-    from hil.view import key_values, show, words
+    from hil.report.view import key_values, show, words
 
     did = "compared" if only_compared else "set and read back"
     table = Table(title=f"node {result.node_id}, mode {result.mode}: {did}", title_justify="left")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import Commands, one_run, print_json
-from hil.outputs import output_file
+from hil.log.outputs import output_file
 
 
 def register(commands: Commands) -> None:
@@ -40,8 +40,8 @@ def register(commands: Commands) -> None:
 
 def cmd_export(args: argparse.Namespace) -> int:
     """Write a log in another format."""
-    from hil.convert.export import FORMATS, export
-    from hil.view import key_values, show
+    from hil.exchange.export import FORMATS, export
+    from hil.report.view import key_values, show
 
     if args.output.suffix.lower() in FORMATS:
         output_file(args.output, *FORMATS)
@@ -55,9 +55,9 @@ def cmd_export(args: argparse.Namespace) -> int:
 
 def cmd_import(args: argparse.Namespace) -> int:
     """Write a recording as a log."""
-    from hil.convert.importing import import_recording
     from hil.errors import HilError
-    from hil.view import key_values, show
+    from hil.exchange.importing import import_recording
+    from hil.report.view import key_values, show
 
     if args.output.exists() and args.recording.exists() and args.output.samefile(args.recording):
         raise HilError(f"{args.output}: is the recording itself; name another file")

@@ -20,8 +20,8 @@ def register(commands: Commands) -> None:
 
 def cmd_demo(args: argparse.Namespace) -> int:
     """Run the demo."""
-    from hil.demo import demo
-    from hil.view import demo_table, show
+    from hil.report.view import demo_table, show
+    from hil.sim.demo import demo
 
     say("demo: emulated drive, closed loop at 1 kHz, load step, replay; about ten seconds")
     result = demo(args.config, overrides(args))

@@ -44,21 +44,21 @@ def register(commands: Commands) -> None:
 
 def cmd_emulate(args: argparse.Namespace) -> int:
     """Serve the emulated drive until stopped."""
-    from hil.lifeline import end_with
+    from hil.runtime.lifeline import end_with
 
     if args.parent is not None:
         end_with(args.parent)
     with lean_imports():
-        from hil.emulate import serve
+        from hil.sim.emulate import serve
     serve(args.config, overrides(args), args.plant_set)
     return 0
 
 
 def cmd_simulate(args: argparse.Namespace) -> int:
     """Simulate a config, or a sweep over it."""
-    from hil.app import load_setup
-    from hil.simulate import simulate
-    from hil.view import end_rows, key_values, progress, show
+    from hil.report.view import end_rows, key_values, progress, show
+    from hil.runtime.setup import load_setup
+    from hil.sim.simulate import simulate
 
     if args.sweep or args.plant_sweep:
         return _sweep(args)
@@ -78,8 +78,8 @@ def cmd_simulate(args: argparse.Namespace) -> int:
 
 
 def _sweep(args: argparse.Namespace) -> int:
-    from hil.sweep import job_of_sweep, sweep
-    from hil.view import progress, show, sweep_table
+    from hil.campaign.sweep import job_of_sweep, sweep
+    from hil.report.view import progress, show, sweep_table
 
     job, stand = job_of_sweep(args.config, overrides(args), args.plant_set, args.sweep, args.plant_sweep)
     count = stand.plan.count

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import EXIT_FAILED, Commands, print_json, say
-from hil.outputs import output_file
+from hil.log.outputs import output_file
 
 
 def register(commands: Commands) -> None:
@@ -31,13 +31,13 @@ def cmd_faults(args: argparse.Namespace) -> int:
     """Run the matrix."""
     from datetime import UTC, datetime
 
+    from hil.config.shipped import find_config
     from hil.faults.judge import AS_EXPECTED
     from hil.faults.matrix import chosen, load_matrix
     from hil.faults.page import page
     from hil.faults.study import study
     from hil.faults.view import closing, table
-    from hil.shipped import find_config
-    from hil.view import show
+    from hil.report.view import show
 
     html = output_file(args.html, ".html", ".htm") if args.html else None
     shipped = find_config("faults.toml")

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
-from hil.outputs import output_file, output_folder
+from hil.log.outputs import output_file, output_folder
 
 if TYPE_CHECKING:
-    from hil.app import Overrides
+    from hil.runtime.setup import Overrides
 
 
 def register(commands: Commands) -> None:
@@ -53,7 +53,7 @@ def cmd_identify(args: argparse.Namespace) -> int:
         print_json(result)
     else:
         from hil.identify.tables import shown
-        from hil.view import show
+        from hil.report.view import show
 
         for table in shown(result):
             show(table)
@@ -91,15 +91,17 @@ def _from_logs(args: argparse.Namespace, file: Path) -> dict[str, Any]:
 def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
     """The experiments, with the emulator of the configuration where that is asked for."""
     with lean_imports():
-        from hil.app import check_arming, is_emulated_bus, load_setup
-    from hil.arming import confirm
+        from hil.runtime.bus import is_emulated_bus
+        from hil.runtime.refusals import check_arming
+        from hil.runtime.setup import load_setup
     from hil.errors import HilError
     from hil.identify.plan import chosen
     from hil.identify.session import checked, identify, motor_toml
+    from hil.runtime.arming import confirm
 
     names, given = chosen(args.steps), overrides(args)
     if args.emulated and given.channel is None:
-        from hil.demo import own_channel
+        from hil.sim.demo import own_channel
 
         given = replace(given, channel=own_channel("identify"))
     setup = load_setup(args.config, given)
@@ -120,6 +122,6 @@ def _emulator(args: argparse.Namespace, given: Overrides) -> contextlib.Abstract
     """The emulator as a process, or nothing."""
     if not args.emulated:
         return contextlib.nullcontext()
-    from hil.demo import emulator_process
+    from hil.sim.demo import emulator_process
 
     return emulator_process(args.config, given)

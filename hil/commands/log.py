@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import Commands, one_run, print_json
-from hil.outputs import output_log
+from hil.log.outputs import output_log
 
 
 def register(commands: Commands) -> None:
@@ -23,7 +23,7 @@ def register(commands: Commands) -> None:
 def cmd_info(args: argparse.Namespace) -> int:
     """Say what is in a log."""
     from hil.log.info import info, info_of
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     paths = one_run(args.logs)
     found = (info(paths[0]) if len(paths) == 1 else info_of(paths)).as_dict()
@@ -37,7 +37,7 @@ def cmd_info(args: argparse.Namespace) -> int:
 def cmd_recover(args: argparse.Namespace) -> int:
     """Rewrite a damaged log."""
     from hil.log.recover import recover
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     out = output_log(args.output or args.log.with_suffix(".recovered.mcap"))
     found = recover(args.log, out).as_dict() | {"written": str(out)}

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import Commands, say
-from hil.outputs import output_folder
+from hil.log.outputs import output_folder
 
 
 def register(commands: Commands) -> None:
@@ -21,11 +21,11 @@ def register(commands: Commands) -> None:
 
 def cmd_paper(args: argparse.Namespace) -> int:
     """Recompute the paper."""
-    from hil.app import Overrides
-    from hil.demo import closed_loop
+    from hil.config.shipped import find_config
     from hil.paper import run
-    from hil.shipped import find_config
-    from hil.view import show
+    from hil.report.view import show
+    from hil.runtime.setup import Overrides
+    from hil.sim.demo import closed_loop
 
     out = output_folder(args.output, "paper.html")
     say("paper: the corrected design on the bench over the bus (lockstep), then every figure; under a minute")

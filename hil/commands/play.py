@@ -77,12 +77,12 @@ def _number(text: str) -> int:
 
 def cmd_play(args: argparse.Namespace) -> int:
     """Play a log."""
-    from hil.app import sending_bus
-    from hil.clock import RealClock
     from hil.errors import HilError
+    from hil.exchange.play import Choice, Source, ahead, chosen, play
     from hil.log.errors import LogError
-    from hil.play import Choice, Source, ahead, chosen, play
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
+    from hil.runtime.bus import sending_bus
+    from hil.runtime.clock import RealClock
 
     if not 0.0 <= args.from_s <= args.to_s:
         raise HilError(f"--from {args.from_s:g} --to {args.to_s:g}: no such window")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hil.commands.common import Commands, one_run, print_json, say
-from hil.outputs import output_file, output_log
+from hil.log.outputs import output_file, output_log
 
 if TYPE_CHECKING:
     from hil.replay import Verdict, Window
@@ -81,7 +81,7 @@ def cmd_replay(args: argparse.Namespace) -> int:
 
 def _timed(paths: tuple[Path, ...], window: Window) -> tuple[Path, Verdict, float]:
     from hil.replay import replay
-    from hil.view import progress
+    from hil.report.view import progress
 
     start = time.perf_counter()
     with progress(f"replay {paths[0].name}", _ticks_of(paths[0]) if len(paths) == 1 else None) as seen:
@@ -101,10 +101,10 @@ def _ticks_of(path: Path) -> int | None:
 
 
 def _report(args: argparse.Namespace, results: list[tuple[Path, Verdict, float]]) -> None:
-    from hil.view import replay_table, show
+    from hil.report.view import replay_table, show
 
     if args.junit:
-        from hil.junit import junit
+        from hil.report.junit import junit
 
         args.junit.write_text(junit(results), encoding="utf-8")
     if not args.json:
@@ -121,7 +121,7 @@ def _fleet(args: argparse.Namespace) -> int:
     from hil.campaign.view import fleet_table
     from hil.commands.campaign import progress as rate
     from hil.errors import HilError
-    from hil.view import show
+    from hil.report.view import show
 
     if args.config or args.junit or args.start or args.end is not None:
         raise HilError(
@@ -139,9 +139,9 @@ def _fleet(args: argparse.Namespace) -> int:
 
 
 def _what_if(args: argparse.Namespace) -> int:
-    from hil.config import RunConfig, load_toml
-    from hil.view import show, what_if_table
-    from hil.whatif import what_if
+    from hil.config.tables import RunConfig, load_toml
+    from hil.replay.whatif import what_if
+    from hil.report.view import show, what_if_table
 
     config = load_toml(args.config, RunConfig, [])
     out = output_log(args.output) if args.output else None

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import EXIT_FAILED, Commands, print_json
-from hil.outputs import output_file
+from hil.log.outputs import output_file
 
 
 def register(commands: Commands) -> None:
@@ -25,7 +25,7 @@ def cmd_report(args: argparse.Namespace) -> int:
     from hil.log.parts import grouped
     from hil.report.build import build
     from hil.report.criteria import SIGNS, judge
-    from hil.view import key_values, show
+    from hil.report.view import key_values, show
 
     out = output_file(args.output or args.log[0].with_suffix(".html"), ".html", ".png")
     report = build(grouped(args.log), out, verify=not args.no_replay)

@@ -40,8 +40,11 @@ def register(commands: Commands) -> None:
 def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
     with lean_imports():
-        from hil.app import check_arming, is_emulated_bus, load_setup, run
-    from hil.arming import confirm, requesting
+        from hil.runtime.bus import is_emulated_bus
+        from hil.runtime.refusals import check_arming
+        from hil.runtime.session import run
+        from hil.runtime.setup import load_setup
+    from hil.runtime.arming import confirm, requesting
 
     setup = load_setup(args.config, overrides(args))
     check_arming(setup, args.arm)
@@ -52,7 +55,10 @@ def cmd_run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(result.as_dict())
     else:
-        from hil.view import run_table, show  # not before: what it imports would keep the drive waiting
+        from hil.report.view import (  # not before: what it imports would keep the drive waiting
+            run_table,
+            show,
+        )
 
         show(run_table(result))
     return 0 if result.ok else EXIT_FAILED
@@ -60,9 +66,9 @@ def cmd_run(args: argparse.Namespace) -> int:
 
 def cmd_check(args: argparse.Namespace) -> int:
     """Check everything before arming."""
-    from hil.app import load_setup
-    from hil.check import check, check_table, passed
-    from hil.view import show
+    from hil.check.checks import check, check_table, passed
+    from hil.report.view import show
+    from hil.runtime.setup import load_setup
 
     rows = check(load_setup(args.config, overrides(args)))
     if args.json:

@@ -43,8 +43,8 @@ def parsed(items: list[str]) -> tuple[dict[str, float], list[str]]:
 def cmd_set(args: argparse.Namespace) -> int:
     """Set references."""
     from hil.errors import HilError
-    from hil.inbox import SetpointError, ask, outside, shown
-    from hil.watch.registry import choose
+    from hil.runtime.inbox import SetpointError, ask, outside, shown
+    from hil.runtime.registry import choose
 
     values, runs = parsed(args.items)
     runs += [args.run_name] if args.run_name else []

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
 from hil.commands.tuning import _above_one, _lean, _not_negative, _positive
-from hil.outputs import output_file
+from hil.log.outputs import output_file
 
 
 def register(commands: Commands) -> None:
@@ -52,8 +52,8 @@ def cmd_tune(args: argparse.Namespace) -> int:
     """Tune."""
     _lean()
     from hil.identify.tune import at_motor, tune, written
+    from hil.report.view import key_values, progress, show
     from hil.tuning.design import Wish
-    from hil.view import key_values, progress, show
 
     to = args.output or args.config.with_name(f"{args.config.stem}-tuned.toml")
     to = output_file(to, ".toml", config=args.config)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
-from hil.outputs import output_file, output_folder
+from hil.log.outputs import output_file, output_folder
 
 SPREAD = 0.3
 
@@ -147,11 +147,11 @@ def _lean() -> None:
 def cmd_compare(args: argparse.Namespace) -> int:
     """Compare laws."""
     _lean()
+    from hil.report.view import progress, show
     from hil.tuning.compare import Wish, compare, parse_laws
     from hil.tuning.families import DEFAULT_LAWS
     from hil.tuning.page import comparison
     from hil.tuning.tables import comparison_table
-    from hil.view import progress, show
 
     families = parse_laws(",".join(DEFAULT_LAWS) if args.laws is None else args.laws)
     out = output_folder(args.output, "compare.html")
@@ -176,10 +176,10 @@ def cmd_compare(args: argparse.Namespace) -> int:
 def cmd_design(args: argparse.Namespace) -> int:
     """Design windows and poles."""
     _lean()
+    from hil.report.view import show
     from hil.tuning.design import WINDOWS, Wish, design
     from hil.tuning.page import front_picture
     from hil.tuning.tables import design_table
-    from hil.view import show
 
     path = args.output
     if path is None:
@@ -211,11 +211,11 @@ def cmd_design(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any]) -> dict[str, Any]:
-    from hil.design import law_spec
+    from hil.config.design import law_spec
+    from hil.report.view import progress
     from hil.tuning.bench import speed_drive
     from hil.tuning.optimise import law_of
     from hil.tuning.verify import verify
-    from hil.view import progress
 
     setup, spread = speed_drive(args.config, overrides(args)), _spread(args.spread)
     law = law_of(best.tables, law_spec(setup.config), 1.0 / setup.config.loop.rate_hz)

@@ -47,9 +47,9 @@ def _port(text: str) -> int:
 
 def cmd_watch(args: argparse.Namespace) -> int:
     """Watch a run."""
+    from hil.runtime.registry import WatchError, choose
     from hil.watch import terminal
     from hil.watch.look import Look, figures
-    from hil.watch.registry import WatchError, choose
 
     if args.web:
         from hil.watch import web

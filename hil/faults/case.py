@@ -29,15 +29,17 @@ from drivers.bus import open_link
 from drivers.errors import DriverError
 from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from firmware_model.node import BLACK_BOX
-from hil.app import Overrides, Setup, bus_settings, load_setup, run
-from hil.demo import set_up
-from hil.emulate import load_plant, serve
 from hil.errors import ConfigError, HilError
 from hil.faults.judge import Evidence, Result, judge
 from hil.faults.matrix import ClockStep, DiskFull, InterfaceDown, Matrix, Row, Stall, WriterKilled
 from hil.log.reader import open_log
 from hil.replay import replay_log
+from hil.runtime.bus import bus_settings
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import DriveState
+from hil.sim.demo import set_up
+from hil.sim.emulate import load_plant, serve
 
 RUN_TIMEOUT_S: Final = 60.0
 SAYS_NOTHING_S: Final = 20.0

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hil.config import Finite, Positive, RunConfig, Table, load_toml, read_toml, validate
+from hil.config.tables import Finite, Positive, RunConfig, Table, load_toml, read_toml, validate
 from hil.errors import ConfigError
 from hil.signals import Reason
 

@@ -9,11 +9,11 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
-from hil.app import compile_kernels
-from hil.emulate import warm_up
 from hil.faults.case import check_rows, run_row
 from hil.faults.judge import Result
 from hil.faults.matrix import Matrix, Row
+from hil.runtime.session import compile_kernels
+from hil.sim.emulate import warm_up
 
 _fork = multiprocessing.get_context("fork")
 

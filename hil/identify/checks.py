@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from hil.identify.estimate import UNITS, Parameter
 from hil.identify.plan import Step
-from hil.metrics import operating
+from hil.report.metrics import operating
 from hil.signals import TickArray
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.config import MotorTable, RunConfig, validate
+from hil.config.tables import MotorTable, RunConfig, validate
 from hil.errors import ConfigError, HilError
 from hil.identify.estimate import Estimate
 from hil.identify.innerloop import estimate_for

@@ -12,12 +12,12 @@ from typing import Final
 
 import numpy as np
 
-from hil.config import MotorTable, RunConfig
+from hil.config.design import motor_model, speed_filter
+from hil.config.tables import MotorTable, RunConfig
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.control.registry import SpeedFilter
 from hil.control.speed import MOST_DELAY
-from hil.design import motor_model, speed_filter
 from hil.identify import estimate as of_voltages
 from hil.identify.data import SHORTEST, Samples, joined, turning
 from hil.identify.estimate import BROKEN, EXACT, TOLD, UNITS, Estimate, Parameter, excited, thinned

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from hil.config import MotorTable, RunConfig
+from hil.config.tables import MotorTable, RunConfig
 from hil.identify.estimate import Estimate
 
 KEYS: Final = {

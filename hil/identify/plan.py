@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from pydantic import TypeAdapter
 
-from hil.config import ControllerTable, MotorTable, ObserverTable, RunConfig, StepReference
+from hil.config.design import inner_loop
+from hil.config.tables import ControllerTable, MotorTable, ObserverTable, RunConfig, StepReference
 from hil.control.speedfilter import order_of
-from hil.design import inner_loop
 from hil.errors import HilError
 
 STEPS: Final = ("sensors", "standstill", "spinning", "inertia")

@@ -9,8 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from hil.app import RunResult, Setup, run, setup_of
-from hil.config import MotorTable, RunConfig
+from hil.config.tables import MotorTable, RunConfig
 from hil.control.errors import ControlDesignError
 from hil.errors import ConfigError, HilError
 from hil.identify.checks import breakaway, seen_in
@@ -19,7 +18,9 @@ from hil.identify.innerloop import estimate_for
 from hil.identify.motorfile import motor_of, toml_of
 from hil.identify.plan import Skipped, Step, config_of, make
 from hil.log.reader import open_log
-from hil.loop import StopRequest
+from hil.runtime.loop import StopRequest
+from hil.runtime.session import RunResult, run
+from hil.runtime.setup import Setup, setup_of
 from hil.signals import Reason, TickArray
 
 Say = Callable[[str], None]

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from hil.view import words
+from hil.report.view import words
 
 
 def shown(result: dict[str, Any]) -> list[Table]:

@@ -14,12 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from hil.app import Overrides, Setup
 from hil.campaign.case import Stand
 from hil.campaign.plan import PlanTable
 from hil.campaign.values import toml
-from hil.config import MotorTable, RunConfig, override, read_toml, validate
+from hil.config.tables import MotorTable, RunConfig, override, read_toml, validate
 from hil.errors import HilError
+from hil.runtime.setup import Overrides, Setup
 from hil.tuning.bench import speed_drive
 from hil.tuning.design import Wish, design
 

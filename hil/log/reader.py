@@ -117,7 +117,7 @@ class Log:
         ``names``: states, reasons and requests as categories with their names instead of numbers.
         Raises LogError when pandas is not installed.
         """
-        from hil.convert.frame import data_frame
+        from hil.log.frame import data_frame
 
         return data_frame(self, names=names)
 

@@ -168,7 +168,7 @@ def main() -> int:
 
 def _follower(header: dict[str, Any]) -> Follower:
     """What knows the controller's state; the compiled law is loaded for a log in parts alone."""
-    from hil.snapshot import StateFollower
+    from hil.replay.snapshot import StateFollower
 
     return StateFollower(header)
 

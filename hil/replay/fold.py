@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hil.config.design import Machine
 from hil.control.jit import jit
-from hil.design import Machine
-from hil.kernel import step
 from hil.log.check import first_broken
 from hil.replay.verdict import Difference
 from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
+from hil.tick.kernel import step
 
 _KINDS = {field.name: field.kind for field in FIELDS}
 

@@ -19,7 +19,7 @@ from drivers.mapping import RECEIVED, map_of
 from drivers.refeed import refeed
 from drivers.tables import incoming_tables
 from drivers.wire import FRAME, STATE
-from hil.config import RunConfig, validate
+from hil.config.tables import RunConfig, validate
 from hil.errors import HilError
 from hil.log.reader import Log
 from hil.log.schema import Records

@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from hil.config import RunConfig, validate
+from hil.config.design import Machine, SlowMessage, WireFacts, build
+from hil.config.tables import RunConfig, validate
 from hil.control.law import LAW_NEUTRAL, LAW_PARAMS, new_law_state
 from hil.control.references import REFERENCE, REFERENCE_NEUTRAL
-from hil.design import Machine, SlowMessage, WireFacts, build
 from hil.errors import HilError
-from hil.guard import SAFETY_NEUTRAL, SAFETY_PARAMS
-from hil.kernel import new_safety_state
 from hil.log.named import Record, fill, read_named, to_named
 from hil.log.origin import is_own
 from hil.log.reader import Log
 from hil.replay.ranges import COUNTERS, check_ranges
+from hil.tick.guard import SAFETY_NEUTRAL, SAFETY_PARAMS
+from hil.tick.kernel import new_safety_state
 
 _UNUSABLE = (KeyError, ValueError, TypeError, RecursionError)
 _PARAMETERS = {

@@ -12,9 +12,9 @@ from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
 from hil.control.speedfilter import MOST_AVERAGE, PAST
-from hil.guard import MOST_MESSAGES, MOST_PERIODS
 from hil.log.named import Record
 from hil.signals import DriveState
+from hil.tick.guard import MOST_MESSAGES, MOST_PERIODS
 
 COUNTERS: Final = 256
 """Commands that the supervisor remembers: the range of a counter on the wire."""

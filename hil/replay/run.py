@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hil.design import Machine
+from hil.config.design import Machine
 from hil.errors import HilError
 from hil.log.reader import Frame, Log, Source, new_log, read_blocks
 from hil.log.schema import FRAME, Records

@@ -8,13 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.app import frame_time, message_names
-from hil.config import RunConfig, validate
+from hil.config.design import Machine
+from hil.config.tables import RunConfig, validate
 from hil.control.law import exact_after
-from hil.design import Machine
 from hil.errors import ConfigError, HilError
 from hil.log.reader import Log, Source, new_log, read_blocks
-from hil.reasons import explain
 from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
@@ -22,7 +20,9 @@ from hil.report.excursions import Excursions
 from hil.report.frames import Frames, FrameTime
 from hil.report.segments import Responses
 from hil.report.statistics import Phases, Spectrum, Totals
+from hil.runtime.bus import frame_time, message_names
 from hil.signals import DriveState, TickArray
+from hil.tick.reasons import explain
 
 STOP_WEIGHT: Final = 1e6  # a close-up of an end outweighs that of any load step
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from hil.config import RunConfig
+from hil.config.tables import RunConfig
 from hil.signals import FIELDS, DriveState, Field, RxFlag, TickArray
 
 F8 = npt.NDArray[np.float64]

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from hil.metrics import RECOVERED_RAD_S
 from hil.report.curves import F8
+from hil.report.metrics import RECOVERED_RAD_S
 from hil.report.segments import largest
 from hil.signals import DriveState, TickArray
 

@@ -13,7 +13,7 @@ from html import escape
 from importlib.resources import files
 from typing import Any, Final
 
-from hil.filtered import known
+from hil.config.filtered import known
 from hil.report.collect import Run
 from hil.report.criteria import (
     FIGURES,

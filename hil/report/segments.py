@@ -13,8 +13,8 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hil.metrics import RECOVERED_RAD_S
 from hil.report.curves import F8
+from hil.report.metrics import RECOVERED_RAD_S
 from hil.signals import DriveState, TickArray
 
 MOST_TICKS: Final = 10_000

@@ -9,14 +9,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.app import Overrides, Setup, load_setup
+from hil.config.design import motor_model
 from hil.control.law import CASCADE, FAC, MTPA, PI
-from hil.design import motor_model
-from hil.emulate import load_plant
 from hil.errors import HilError
-from hil.metrics import RECOVERED_RAD_S, find_step, operating
+from hil.report.metrics import RECOVERED_RAD_S, find_step, operating
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import Reason, TickArray
-from hil.simulate import simulate_ticks
+from hil.sim.emulate import load_plant
+from hil.sim.simulate import simulate_ticks
 from hil.tuning.measure import Bench
 
 QUIET_S: Final = 0.5

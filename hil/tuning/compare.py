@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from hil.app import Overrides
-from hil.design import law_spec
-from hil.emulate import load_plant
+from hil.config.design import law_spec
 from hil.errors import HilError
+from hil.runtime.setup import Overrides
+from hil.sim.emulate import load_plant
 from hil.tuning.bench import bench_of, corner_settings, simulated, speed_drive
 from hil.tuning.families import Family, family, settings_of, toml
 from hil.tuning.measure import Bench, judge

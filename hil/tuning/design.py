@@ -16,10 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.app import Overrides
+from hil.config.design import law_spec
 from hil.control.law import LawSpec
-from hil.design import law_spec
 from hil.errors import HilError
+from hil.runtime.setup import Overrides
 from hil.tuning.bench import bench_of, speed_drive
 from hil.tuning.families import Family, family, toml
 from hil.tuning.loop import rigid, shaft

@@ -19,7 +19,7 @@ import numpy as np
 
 from hil.control.law import MotorModel, new_law_state
 from hil.control.linalg import Array
-from hil.metrics import RECOVERED_RAD_S
+from hil.report.metrics import RECOVERED_RAD_S
 from hil.tuning.loop import LOAD, PULSE_I, PULSE_U, PULSE_W, Plant, Record, respond_all, rigid, shaft
 
 RESPONSE_S: Final = 0.4

@@ -6,8 +6,8 @@ from typing import Any
 
 from rich.table import Table
 
+from hil.report.view import key_values
 from hil.tuning.page import COLUMNS, cell
-from hil.view import key_values
 
 
 def comparison_table(found: dict[str, Any]) -> Table:

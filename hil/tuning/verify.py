@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from hil.app import Overrides, load_setup, run
-from hil.demo import emulator_process, own_channel
 from hil.log.reader import open_log
-from hil.simulate import simulate_ticks
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.demo import emulator_process, own_channel
+from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, corner_settings, seen_in
 from hil.tuning.families import Tables, settings_of
 from hil.tuning.loop import Record

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from hil.clock import RealClock
-from hil.inbox import SetpointError, ask, outside, shown
 from hil.log.errors import LogError
 from hil.log.info import info
 from hil.log.records import EVENT, EVENT_BYTES
 from hil.log.ring import RingError, attach
+from hil.runtime.clock import RealClock
+from hil.runtime.inbox import SetpointError, ask, outside, shown
+from hil.runtime.registry import Entry, WatchError, ask_stop, is_alive
 from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
-from hil.watch.registry import Entry, WatchError, ask_stop, is_alive
 
 SILENT_S, SILENT_PERIODS = 0.3, 3
 """Age from which a tick is no longer news, and at least so many periods."""

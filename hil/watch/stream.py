@@ -15,9 +15,9 @@ import numpy as np
 
 from hil.log.ring import RingError, attach
 from hil.log.schema import FRAME, FRAME_HEAD, TOPICS, file_descriptor_set, frame_messages, pack_event
+from hil.runtime.registry import WatchError, choose
 from hil.signals import TickArray
 from hil.watch.look import Look, outcome
-from hil.watch.registry import WatchError, choose
 
 PERIOD_S: Final = 0.05
 BACKLOG: Final = 4096

@@ -17,12 +17,12 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from hil.arming import keys_at_once
 from hil.errors import plain
+from hil.runtime.arming import keys_at_once
+from hil.runtime.registry import Entry
 from hil.signals import FIELDS, Field, TickArray
 from hil.watch.feed import LIVE
 from hil.watch.look import Event, Look, figures, outcome
-from hil.watch.registry import Entry
 
 REFRESH_S: Final = 0.25
 SHOWN_S: Final = 3.5  # the ring holds 4 s

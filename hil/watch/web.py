@@ -23,8 +23,8 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
+from hil.runtime.registry import WatchError
 from hil.watch.feed import Feed
-from hil.watch.registry import WatchError
 
 PERIOD_S: Final = 0.1
 TOKEN_BYTES: Final = 32

@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, header_of, load_setup
 from hil.cli import main
-from hil.demo import emulator_process
 from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
 from hil.log.recover import recover
 from hil.report.build import build
-from hil.simulate import simulate
+from hil.runtime.header import header_of
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.demo import emulator_process
+from hil.sim.simulate import simulate
 from tests.browser.chromium import Page
 from tests.conftest import CONFIGS
 from tests.process.test_run import flags, hil

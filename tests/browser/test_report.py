@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, Setup, header_of, load_setup
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.log.mcapfile import RunFile
+from hil.replay.whatif import what_if
 from hil.report.build import build
+from hil.runtime.header import header_of
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import TickArray, new_ticks
-from hil.simulate import simulate, simulate_ticks
-from hil.whatif import what_if
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.browser.chromium import Page
 from tests.conftest import CONFIGS
 

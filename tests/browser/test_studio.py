@@ -9,8 +9,8 @@ from typing import Any
 import matplotlib.image
 import pytest
 
-from hil.app import Overrides, load_setup
-from hil.simulate import simulate
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate
 from tests.browser.chromium import Browser, Page
 from tests.browser.studio import studio
 from tests.conftest import CONFIGS

@@ -18,10 +18,10 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState
+from hil.sim.demo import emulator_process
 from tests.browser.chromium import Browser
 from tests.process.test_run import call, flags, hil, only_log, voltages_after_stop
 from tests.process.test_watch import wait_for_run

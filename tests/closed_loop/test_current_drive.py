@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from hil.app import Overrides, Setup, load_setup
-from hil.check import reach_rows, speed_filter_rows
-from hil.config import MovingAverageFilter
+from hil.check.checks import reach_rows, speed_filter_rows
+from hil.check.filtered import filter_rows
+from hil.config.design import speed_filter
+from hil.config.tables import MovingAverageFilter
 from hil.control.law import (
     LAW_PARAMS,
     ChannelSpec,
@@ -24,16 +25,15 @@ from hil.control.law import (
 )
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speed import flowed, latched
-from hil.design import speed_filter
 from hil.errors import HilError
-from hil.filtered import filter_rows
-from hil.metrics import operating
 from hil.replay import replay
+from hil.replay.whatif import what_if
 from hil.report.build import build
 from hil.report.curves import plots_of
+from hil.report.metrics import operating
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import GuardFlag, Reason, TickArray
-from hil.simulate import simulate, simulate_ticks
-from hil.whatif import what_if
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import CONFIGS
 
 PATH = CONFIGS / "current.toml"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.identify.innerloop import estimate_for
 from hil.identify.session import Session, planned, setup_for
 from hil.signals import Reason, TickArray
-from hil.simulate import simulate_ticks
+from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.compiled

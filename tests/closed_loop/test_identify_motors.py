@@ -12,7 +12,7 @@ from hil.identify.estimate import Parameter
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, planned, setup_for
 from hil.signals import Reason
-from hil.simulate import simulate_ticks
+from hil.sim.simulate import simulate_ticks
 
 pytestmark = pytest.mark.compiled
 GOALS = {"R_s": 0.02, "L_d": 0.02, "L_q": 0.02, "psi_f": 0.02, "J": 0.03, "coulomb": 0.1}

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from hil.app import Overrides, load_setup
 from hil.control.mtpa import operating_point
-from hil.metrics import operating
+from hil.report.metrics import operating
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import GuardFlag, Reason, TickArray
-from hil.simulate import simulate_ticks
+from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 from tests.contract.lockstep import held_in_lockstep
 

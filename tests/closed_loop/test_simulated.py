@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
-from hil.demo import resolution_bound, true_motor
-from hil.design import motor_model
-from hil.emulate import load_plant
-from hil.metrics import load_step, operating, tracking_rms
+from hil.config.design import motor_model
+from hil.report.metrics import load_step, operating, tracking_rms
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import Reason, TickArray
-from hil.simulate import simulate_ticks
+from hil.sim.demo import resolution_bound, true_motor
+from hil.sim.emulate import load_plant
+from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
 PATH = CONFIGS / "demo.toml"
@@ -51,7 +51,7 @@ def test_the_estimate_is_within_what_the_frames_resolve() -> None:
 
 def test_the_length_of_a_block_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = simulated((), "loop.duration_s=0.5")
-    monkeypatch.setattr("hil.simulate.BLOCK", 7)
+    monkeypatch.setattr("hil.sim.simulate.BLOCK", 7)
     parts = simulate_ticks(load_setup(PATH, Overrides(settings=("loop.duration_s=0.5",))), [])
     assert len(whole) > 500 and parts.tobytes() == whole.tobytes()
 

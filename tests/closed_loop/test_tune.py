@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hil.cli import main
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.identify.tune import LEAST_SPREAD, UNKNOWN_SPREAD, spread_of
 
 MOTOR = """

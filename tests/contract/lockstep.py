@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.app import Overrides
-from hil.demo import closed_loop
 from hil.replay import Verdict, replay
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState, Reason
+from hil.sim.demo import closed_loop
 
 
 def held_in_lockstep(path: Path, folder: Path) -> Verdict:

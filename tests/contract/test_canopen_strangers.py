@@ -11,7 +11,7 @@ import can
 import pytest
 
 from drivers.errors import DatabaseError, NodeError
-from hil.configure import compare, configure
+from hil.runtime.configure import compare, configure
 from tests.canopen import NODE, durand_drive, job
 
 Refused = (DatabaseError, NodeError)

@@ -18,7 +18,7 @@ from drivers.bus import Frame
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from tests.canopen import EDS, NODE, emulated
 from tests.contract.test_drive_firmware import Wires
 

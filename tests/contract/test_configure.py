@@ -15,8 +15,8 @@ from canopen import SdoAbortedError
 
 from drivers.errors import DatabaseError, NodeError
 from hil.cli import main
-from hil.configure import Result, compare, configure, lost
 from hil.errors import ConfigError, HilError
+from hil.runtime.configure import Result, compare, configure, lost
 from tests.canopen import EDS, NODE, bus_of, emulated, job, recorded, run_config, stranger
 
 SDO_TO, SDO_FROM, NMT = 0x600 + NODE, 0x580 + NODE, 0x000

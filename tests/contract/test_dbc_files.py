@@ -15,7 +15,7 @@ from drivers.codec import Database
 from drivers.errors import DatabaseError, EncodeError
 from drivers.mapping import house_map
 from drivers.units import CELSIUS, CURRENT, SPEED, TORQUE, VOLTAGE, unit_of
-from hil.app import Overrides, load_setup
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import new_ticks
 from tests.conftest import CONFIGS
 from tests.contract.test_map_bits import Broken, database, other, refusal

@@ -70,7 +70,7 @@ def bench(request: pytest.FixtureRequest, channel: str) -> Iterator[Bench]:
 
 
 def test_flags_are_hils_own() -> None:
-    own = {"GUARDIAN", "GUARDIAN_LOST"}  # set by hil.guardian, never by a bus
+    own = {"GUARDIAN", "GUARDIAN_LOST"}  # set by hil.runtime.guardian, never by a bus
     theirs = {name: flag.value for name, flag in RxFlag.__members__.items() if name not in own}
     assert theirs == {name: getattr(frames, name) for name in theirs}
 

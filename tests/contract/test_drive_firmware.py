@@ -19,7 +19,7 @@ from drivers.bus import Frame
 from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from tests.conftest import CONFIGS
 
 COMMAND_IDS = bytes.fromhex("395C9840D9E9D87342086F2736513DF8")

@@ -22,9 +22,9 @@ from drivers.drive import BUILT_IN, Drive, DriveKind, DriveKindError, drive_kind
 from drivers.errors import LinkDown
 from drivers.frames import FOREIGN_COMMAND, FRESH
 from drivers.mapping import COMMANDED_D, COMMANDED_Q, MEASURED
-from hil.app import Overrides, Setup, load_setup
-from hil.check import check, passed
+from hil.check.checks import check, passed
 from hil.errors import ConfigError
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import new_ticks
 from tests.conftest import CONFIGS, ROOT
 

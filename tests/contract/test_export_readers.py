@@ -17,11 +17,11 @@ import pytest
 
 import hil
 from hil.cli import main
-from hil.convert import export as module
-from hil.convert.export import export
-from hil.convert.frame import MissingPackage, need
-from hil.convert.recording import Recording
+from hil.exchange import export as module
+from hil.exchange.export import export
+from hil.exchange.recording import Recording
 from hil.log.errors import LogError
+from hil.log.frame import MissingPackage, need
 from hil.log.mcapfile import RunFile
 from hil.log.schema import Records
 from hil.signals import FIELDS, DriveState
@@ -111,7 +111,7 @@ def test_mat_is_what_scipy_writes_at_once(path: Path, tmp_path: Path) -> None:
 def test_mat_refuses_more_ticks_than_a_variable_holds(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:
-    monkeypatch.setattr("hil.convert.tables.MAT_TICKS", 499)
+    monkeypatch.setattr("hil.exchange.tables.MAT_TICKS", 499)
     assert main(["export", str(path), "-o", str(tmp_path / "a.mat")]) == 2
     assert "at most 499 ticks; take .parquet or .mf4" in capsys.readouterr().err
     assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]

@@ -29,14 +29,23 @@ from drivers.bcm import SO_TIMESTAMPNS, TX_DELETE, KernelSync
 from drivers.bus import BusSettings, SocketLink, open_link
 from drivers.client import DriveClient
 from drivers.local import CLASSIC, pack_frame
-from hil import fused
-from hil.app import Overrides, Setup, header_of, load_setup
-from hil.clock import RealClock
-from hil.guardian import ARMED, BEAT_NS, COUNTER, FIRED, GUARD_NS, GUARDIAN_LOST_NS, GuardedDrive, Words
 from hil.log.check import first_broken
 from hil.log.reader import Log, open_log
 from hil.log.recorder import Recorder, open_recorder
-from hil.loop import (
+from hil.runtime import fused
+from hil.runtime.clock import RealClock
+from hil.runtime.guardian import (
+    ARMED,
+    BEAT_NS,
+    COUNTER,
+    FIRED,
+    GUARD_NS,
+    GUARDIAN_LOST_NS,
+    GuardedDrive,
+    Words,
+)
+from hil.runtime.header import header_of
+from hil.runtime.loop import (
     BEGUN,
     DECIDED,
     NOT_BEGUN,
@@ -52,6 +61,7 @@ from hil.loop import (
     no_whole,
     none_compiled,
 )
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
 

@@ -19,7 +19,7 @@ from drivers.errors import DatabaseError, EncodeError, LinkError
 from drivers.listen import listen
 from drivers.mapping import DriveMap, house_map, map_from_table
 from drivers.states import translator
-from hil.app import wire_facts
+from hil.runtime.setup import wire_facts
 from hil.signals import RxFlag, new_ticks
 from tests.conftest import CONFIGS
 from tests.contract.test_drive_map import OTHER_DBC, OTHER_TABLE

@@ -29,12 +29,13 @@ from drivers.oneshot import NoAnswer
 from drivers.wire import FRAME
 from firmware_model.moteus import BadFrame, MoteusFrames, padded, subframes
 from firmware_model.plant import ErrorCode, State, Takes
-from hil.app import Overrides, Setup, check_reachable, load_setup
-from hil.check import unwatched_rows
-from hil.convert.importing import import_recording
+from hil.check.checks import unwatched_rows
 from hil.errors import ConfigError
+from hil.exchange.importing import import_recording
 from hil.log.errors import LogError
 from hil.replay.sent import SentCheck
+from hil.runtime.refusals import check_reachable
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import Controlword, DriveState, RxFlag, new_ticks
 from tests.conftest import CONFIGS
 from tests.contract.lockstep import held_in_lockstep

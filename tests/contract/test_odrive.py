@@ -18,7 +18,7 @@ from drivers.errors import DatabaseError
 from drivers.oneshot import NoAnswer
 from drivers.wire import FRAME
 from firmware_model.odrive import ODriveFrames
-from hil.app import Overrides, Setup, load_setup
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import Controlword, DriveState, new_ticks
 from tests.conftest import CONFIGS
 from tests.contract.lockstep import held_in_lockstep

@@ -20,7 +20,7 @@ from drivers.local import pack_frame
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
 from firmware_model.station import STARTED
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.compiled  # interpreted there is but one way

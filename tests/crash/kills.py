@@ -26,14 +26,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hil.app import Overrides, load_setup
-from hil.config import RunConfig, load_toml
-from hil.emulate import make_node
+from hil.config.tables import RunConfig, load_toml
 from hil.log.info import info
 from hil.log.reader import open_log
 from hil.log.recover import recover
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState
-from hil.simulate import simulate_ticks
+from hil.sim.emulate import make_node
+from hil.sim.simulate import simulate_ticks
 from tests.crash.delay import delays, verdict
 from tests.crash.processes import CONFIG, PATIENCE_S, alive, ended, forked
 

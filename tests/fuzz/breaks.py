@@ -23,7 +23,7 @@ from tests.fuzz.files import Take
 from tests.mutation.mutants import put_in_place
 from tests.mutation.operators import mutants
 
-# of hil/guard.py: function, text of the line, what becomes what
+# of hil/tick/guard.py: function, text of the line, what becomes what
 GUARD = (
     ("guard_command", "if not (math.isfinite(u_q)", "if not", "if False:"),
     ("guard_command", 'if t["state"] != DriveState', "if t", "if False:"),
@@ -48,9 +48,9 @@ GUARD = (
 
 def guard_breaks() -> dict[str, Callable[[], None]]:
     """Each as a function that puts it in place. One that the source has no place for any more is named."""
-    lines = (client.DBC.parents[2] / "hil" / "guard.py").read_text(encoding="utf-8").splitlines()
+    lines = (client.DBC.parents[2] / "hil/tick/guard.py").read_text(encoding="utf-8").splitlines()
     found: dict[str, Callable[[], None]] = {}
-    everything = mutants("hil/guard.py")
+    everything = mutants("hil/tick/guard.py")
     for name, line, before, after in GUARD:
         fits = [
             each

@@ -8,9 +8,9 @@ from pathlib import Path
 from drivers.codec import Database
 from drivers.errors import DriverError
 from firmware_model.config import PlantConfig
-from hil.config import RunConfig, load_toml
-from hil.convert.recording import Recording
+from hil.config.tables import RunConfig, load_toml
 from hil.errors import HilError
+from hil.exchange.recording import Recording
 from hil.faults.matrix import Matrix
 from hil.log.info import info
 from hil.log.reader import open_log

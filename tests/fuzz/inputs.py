@@ -16,7 +16,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from hil.faults.matrix import Matrix
 from tests.fuzz import client, codec, guard
 from tests.fuzz.files import (

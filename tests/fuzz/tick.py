@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.config import RunConfig, load_toml
-from hil.design import WireFacts, build
+from hil.config.design import WireFacts, build
+from hil.config.tables import RunConfig, load_toml
 from hil.signals import DriveState, Request, RxFlag, new_ticks
 from tests.fuzz.draw import Draw
 from tests.fuzz.files import Take

@@ -39,10 +39,10 @@ SAFETY = (
     "test_guard_current.py",
 )
 JUDGES = {
-    "hil/guard.py": SAFETY,
-    "hil/supervisor.py": SAFETY,
-    "hil/guardian.py": ("test_guardian.py",),
-    "hil/setpoint.py": ("test_setpoint.py",),
+    "hil/tick/guard.py": SAFETY,
+    "hil/tick/supervisor.py": SAFETY,
+    "hil/runtime/guardian.py": ("test_guardian.py",),
+    "hil/tick/setpoint.py": ("test_setpoint.py",),
 }
 """The tests of tests/unit that judge the mutants of a file."""
 FILES = tuple(JUDGES)

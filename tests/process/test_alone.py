@@ -13,11 +13,11 @@ from pathlib import Path
 import can
 import pytest
 
-from hil.app import Overrides
-from hil.claim import ClaimedError, claimed
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.claim import ClaimedError, claimed
+from hil.runtime.setup import Overrides
 from hil.signals import RxFlag
+from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process
@@ -80,7 +80,7 @@ def test_a_second_emulator_of_a_node_says_so(configs: Path, settings: Settings) 
 
 def test_a_name_is_free_once_its_process_is_killed() -> None:
     script = (
-        "import time\nfrom hil.claim import claimed\n"
+        "import time\nfrom hil.runtime.claim import claimed\n"
         "with claimed('hil-local', 'c', ['x']): print(1, flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as holder:

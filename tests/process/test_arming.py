@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 from drivers.local import CLASSIC, open_sockets
-from hil.app import Overrides
-from hil.arming import HOLD_NS, DeadMan
-from hil.demo import emulator_process
 from hil.log.reader import open_log
 from hil.replay import replay
+from hil.runtime.arming import HOLD_NS, DeadMan
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState, Request
+from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process

@@ -136,7 +136,7 @@ def test_a_worker_of_another_version_is_refused_by_name_and_an_equal_one_taken(t
     other, known = tmp_path / "other", tmp_path / "scheduler.json"
     for package in ("hil", "drivers", "firmware_model"):
         shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("__pycache__"))
-    with (other / "hil" / "guard.py").open("a") as file:
+    with (other / "hil/tick/guard.py").open("a") as file:
         file.write("# changed\n")
     path, env = plan_file(tmp_path), {**os.environ, "PYTHONPATH": str(other)}
     file_of = ("--scheduler-file", str(known))

@@ -15,11 +15,11 @@ import pytest
 from drivers.kernel import InterfaceFacts
 from drivers.listen import Heard, Traffic
 from drivers.local import open_sockets
-from hil.app import Overrides, Setup, load_setup
-from hil.check import bus_rows, interface_rows, load_row, passed, traffic_rows
-from hil.config import BusTable
-from hil.demo import emulator_process
-from hil.preflight import Row, clock_row, disk_row
+from hil.check.checks import bus_rows, interface_rows, load_row, passed, traffic_rows
+from hil.check.preflight import Row, clock_row, disk_row
+from hil.config.tables import BusTable
+from hil.runtime.setup import Overrides, Setup, load_setup
+from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags
 
 pytestmark = pytest.mark.process
@@ -269,7 +269,7 @@ def test_rate_damage_and_another_controller_are_seen(configs: Path, settings: Se
 def test_damaged_frames_and_counter_jumps_on_a_bus(configs: Path, settings: Settings, channel: str) -> None:
     from drivers.bus import open_link
     from drivers.listen import listen
-    from hil.app import bus_settings
+    from hil.runtime.bus import bus_settings
 
     setup = setup_of(configs, settings)
     feedback = setup.database.message("FEEDBACK")
@@ -303,8 +303,8 @@ def test_clock_and_disk(tmp_path: Path) -> None:
 def test_rights_are_given_back() -> None:
     import os
 
-    from hil.config import RealtimeTable
-    from hil.realtime import probe
+    from hil.config.tables import RealtimeTable
+    from hil.runtime.realtime import probe
 
     before = os.sched_getaffinity(0)
     probe(RealtimeTable(fifo_priority=1, cpu=min(before)))

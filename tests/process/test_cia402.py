@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState
+from hil.sim.demo import emulator_process
 from tests.canopen import NODE, PATIENT, durand_drive, recorded, run_config
 from tests.process.test_run import call, flags
 

@@ -29,7 +29,7 @@ OTHERS = 0o077
 BUSES = IPv4Network("239.192.0.0/14")
 """Multicast groups of ``hil-local``: joined on loopback alone, sent with TTL 0."""
 CLAIM = re.compile("@hil-drive/[0-9a-f]{64}")
-"""A name in the kernel that a process holds and never accepts at: see hil/claim.py."""
+"""A name in the kernel that a process holds and never accepts at: see hil/runtime/claim.py."""
 LISTENS = "0A"
 NO_SUCH_USER = 65534
 

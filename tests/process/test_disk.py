@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
 from hil.replay import replay_log
+from hil.runtime.setup import Overrides
+from hil.sim.demo import emulator_process
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from hil.faults.case import check_rows, run_row
 from hil.faults.matrix import ClockStep, Matrix, load_matrix
 from hil.log.reader import open_log

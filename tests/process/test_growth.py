@@ -12,11 +12,12 @@ import pytest
 
 from drivers.bus import BusSettings, Link, open_link
 from drivers.client import DriveClient
-from hil import fused
-from hil.app import Overrides, header_of, load_setup
-from hil.clock import LockstepClock, RealClock
 from hil.log.recorder import Recorder
-from hil.loop import NOT_BEGUN, Loop, Pace, Plan, StopRequest, Whole, none_compiled
+from hil.runtime import fused
+from hil.runtime.clock import LockstepClock, RealClock
+from hil.runtime.header import header_of
+from hil.runtime.loop import NOT_BEGUN, Loop, Pace, Plan, StopRequest, Whole, none_compiled
+from hil.runtime.setup import Overrides, load_setup
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.process, pytest.mark.compiled]

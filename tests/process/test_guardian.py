@@ -17,12 +17,12 @@ import can
 import pytest
 
 from drivers.codec import Database
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.errors import HilError
-from hil.guardian import GUARDIAN_LOST_NS, STOPS, GuardedDrive, Rights, Word, guardian, guardian_flags
 from hil.log.reader import open_log
+from hil.runtime.guardian import GUARDIAN_LOST_NS, STOPS, GuardedDrive, Rights, Word, guardian, guardian_flags
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState, Reason, RxFlag, new_ticks
+from hil.sim.demo import emulator_process
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.process

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config import MotorTable, RunConfig, load_toml
+from hil.config.tables import MotorTable, RunConfig, load_toml
 from hil.log.reader import open_log
 from hil.replay import replay
 from tests.conftest import CONFIGS, ROOT

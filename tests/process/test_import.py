@@ -14,17 +14,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup, run
 from hil.cli import main
-from hil.convert.export import export
-from hil.convert.importing import OURS, THEIRS, import_recording
-from hil.convert.periods import Grid, Heard, Period, Roles, periods, with_ahead
-from hil.convert.recording import Recording
-from hil.demo import emulator_process
+from hil.exchange.export import export
+from hil.exchange.importing import OURS, THEIRS, import_recording
+from hil.exchange.periods import Grid, Heard, Period, Roles, periods, with_ahead
+from hil.exchange.recording import Recording
 from hil.log.errors import LogError
 from hil.log.reader import open_log
 from hil.replay import replay
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import FIELDS, INPUTS, DriveState
+from hil.sim.demo import emulator_process
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.process

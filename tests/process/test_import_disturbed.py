@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides
-from hil.convert.export import export
-from hil.convert.importing import OURS, import_recording
-from hil.demo import emulator_process
+from hil.exchange.export import export
+from hil.exchange.importing import OURS, import_recording
 from hil.log.reader import open_log
 from hil.replay import replay
+from hil.runtime.setup import Overrides
 from hil.signals import FIELDS, DriveState, RxFlag
+from hil.sim.demo import emulator_process
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.process
@@ -32,7 +32,7 @@ ESTIMATES = {"d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "filled"}
 RUN = """
 import json, sys
 from pathlib import Path
-from hil.app import Overrides, load_setup, run
+from hil.runtime.session import Overrides, load_setup, run
 print(json.dumps(run(load_setup(Path(sys.argv[1]), Overrides(settings=tuple(sys.argv[2:])))).log))
 """
 STOPS = """

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.setup import Overrides
 from hil.signals import Request
+from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process

@@ -19,12 +19,14 @@ from firmware_model.config import PlantConfig, build_params, new_sample, new_sta
 from firmware_model.inverter import InverterFrames, int24
 from firmware_model.kernels import Kernels
 from firmware_model.plant import State
-from hil.app import Overrides, check_load, load_setup, run
-from hil.config import load_toml
-from hil.demo import emulator_process
+from hil.config.tables import load_toml
 from hil.errors import ArmingError, ConfigError
 from hil.log.reader import open_log
+from hil.runtime.refusals import check_load
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import Reason
+from hil.sim.demo import emulator_process
 from tests.conftest import CONFIGS
 from tests.process.test_arming import Monitor, assert_shadowed, senders
 from tests.process.test_run import call, flags, hil, only_log, wait_for_log

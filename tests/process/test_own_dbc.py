@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from drivers.bus import BusSettings, open_link
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.setup import Overrides
+from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags
 
 pytestmark = pytest.mark.process

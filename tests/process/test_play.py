@@ -15,7 +15,7 @@ from pathlib import Path
 import can
 import pytest
 
-from hil.convert.export import export
+from hil.exchange.export import export
 from hil.log.reader import open_log
 from tests.logfiles import some_ticks, write_log
 from tests.unit.test_play import bus_frames

@@ -17,13 +17,14 @@ import can
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup, run
-from hil.demo import emulator_process
 from hil.log.check import seal
 from hil.log.reader import open_log
 from hil.replay import replay
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import FIELDS, DriveState, Reason, RxFlag
-from hil.simulate import simulate_ticks
+from hil.sim.demo import emulator_process
+from hil.sim.simulate import simulate_ticks
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
@@ -295,12 +296,12 @@ def test_a_run_loads_nothing_that_is_for_other_commands(configs: Path, settings:
     """All that comes before arming: kernels, log, guardian, client; then no drive is there."""
     own = settings("drive.heartbeat_timeout_s=0.1", "log.split_s=60.0")
     code, *modules = loaded("run", str(configs / "demo.toml"), *flags(own))
-    assert code == "2" and {"hil.fused", "hil.guardian", "hil.log.recorder"} <= set(modules)
+    assert code == "2" and {"hil.runtime.fused", "hil.runtime.guardian", "hil.log.recorder"} <= set(modules)
     assert not set(NOT_FOR_A_LOOP) & set(modules)
 
 
 def test_an_emulated_drive_loads_no_exports_either(tmp_path: Path) -> None:
     (tmp_path / "empty.toml").write_text("")
     code, *modules = loaded("emulate", str(tmp_path / "empty.toml"))
-    assert code == "2" and "hil.emulate" in modules
+    assert code == "2" and "hil.sim.emulate" in modules
     assert not {"asammdf", "coverage", "matplotlib", "pandas"} & set(modules)

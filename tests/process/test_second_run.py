@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, load_setup, run
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Reason
+from hil.sim.demo import emulator_process
 from tests.process.test_run import Settings
 
 pytestmark = pytest.mark.process

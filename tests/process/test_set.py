@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides
 from hil.cli import main
-from hil.demo import emulator_process
 from hil.log.reader import Log, open_log
 from hil.replay import replay
+from hil.runtime.registry import matching
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState, Reason, Request
+from hil.sim.demo import emulator_process
 from hil.watch.look import Look
-from hil.watch.registry import matching
 from tests.process.test_run import Settings, call, flags, hil, only_log, wait_for_log
 
 pytestmark = pytest.mark.process

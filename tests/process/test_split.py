@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup, run
 from hil.cli import main
-from hil.demo import emulator_process, own_channel
 from hil.log.check import seal
 from hil.log.errors import LogError
 from hil.log.parts import grouped
@@ -24,8 +22,11 @@ from hil.log.recorder import check_folder
 from hil.log.recover import recover
 from hil.log.split import Limits, SplitFile
 from hil.replay import replay
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import FIELDS
-from hil.simulate import simulate, simulate_ticks
+from hil.sim.demo import emulator_process, own_channel
+from hil.sim.simulate import simulate, simulate_ticks
 from hil.tuning.verify import same_run
 from tests.conftest import CONFIGS
 from tests.logfiles import HEADER, some_frames, some_ticks
@@ -199,7 +200,7 @@ def test_every_frame_is_in_one_part_and_with_its_ticks(tmp_path: Path, limits: L
 def test_lost_ticks_leave_the_next_part_without_a_state(
     parts: list[Path], whole: Any, tmp_path: Path
 ) -> None:
-    from hil.snapshot import StateFollower
+    from hil.replay.snapshot import StateFollower
 
     log = open_log(parts[0])
     header = {"metadata": log.metadata["run"], "attachments": log.attachments}

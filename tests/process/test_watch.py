@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
+from hil.runtime.registry import WatchError, choose
+from hil.runtime.setup import Overrides
 from hil.signals import DriveState
+from hil.sim.demo import emulator_process
 from hil.watch.look import Look, outcome
-from hil.watch.registry import WatchError, choose
 from tests.process.test_run import call, flags, hil, only_log, voltages_after_stop
 
 pytestmark = pytest.mark.process

@@ -18,10 +18,10 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.schema import TOPICS, file_descriptor_set
+from hil.runtime.setup import Overrides
 from hil.signals import TICK, DriveState, ticks_from
+from hil.sim.demo import emulator_process
 from tests.node import has_packages, node
 from tests.process.test_run import call, flags, hil
 from tests.process.test_watch import wait_for_run

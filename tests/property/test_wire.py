@@ -17,8 +17,8 @@ from drivers.local import ERR_FLAG, FD, pack_frame
 from drivers.mapping import RECEIVED, house_map
 from drivers.tables import incoming_tables, laid_out, outgoing_tables
 from drivers.wire import FRAME, MESSAGE, ROOM, SIGNAL, STATE, UNKNOWN, encode, phys_of, take
-from hil.app import Overrides, load_setup
 from hil.log.schema import FRAME as LOGGED_FRAME
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import TICK, new_ticks
 from tests.conftest import CONFIGS
 

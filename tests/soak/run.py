@@ -25,10 +25,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hil.app import Overrides
-from hil.demo import emulator_process
 from hil.log.reader import open_log
 from hil.replay import replay
+from hil.runtime.setup import Overrides
+from hil.sim.demo import emulator_process
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "demo.toml"
 SAMPLES = 400

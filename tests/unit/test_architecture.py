@@ -12,12 +12,26 @@ from tests.conftest import ROOT
 PACKAGES = ("hil", "drivers", "firmware_model")
 STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclasses", "math", "typing", "enum"}
 STDLIB_OK |= {"cmath", "functools", "importlib", "sys"}
-ROOT_MODULES = ("app", "fused", "cli", "emulate", "simulate", "demo", "check", "faults/case")
-ROOT_MODULES += ("convert/rerun", "campaign/case", "replay/frames", "replay/sent", "configure")
+ROOT_MODULES = ("runtime/setup", "runtime/bus", "runtime/header", "runtime/refusals", "runtime/session")
+ROOT_MODULES += ("cli", "runtime/configure", "sim/emulate", "sim/simulate", "sim/demo", "check/checks")
+ROOT_MODULES += ("runtime/fused",)
+ROOT_MODULES += ("faults/case", "exchange/rerun", "campaign/case", "replay/frames", "replay/sent")
 ROOT_MODULES += ("manual/schema",)
 JIT = "drivers.jit"
 """The one jit module of all: knows neither controller nor drive, so that control may re-export it."""
 COMPOSITION = {f"hil/{name}.py" for name in ROOT_MODULES}
+
+
+ROOMS = (
+    "control", "log", "tick", "config", "runtime", "replay", "report", "sim", "paper", "tuning", "check",
+    "faults", "campaign", "identify", "watch", "exchange", "manual", "bench", "api", "commands",
+)  # fmt: skip
+"""The rooms of hil, each of which may import from those before it."""
+UPWARD = {
+    ("hil/config/filtered.py", "hil.tuning.current"),  # asked only for a drive with a filter; loads scipy
+    ("hil/log/writer.py", "hil.replay.snapshot"),  # a process of its own, which follows the ticks
+}
+LOOSE = {"__init__", "cli", "errors", "ports", "signals"}
 
 
 def imports(path: Path) -> set[str]:
@@ -70,7 +84,7 @@ def test_only_the_composition_root_knows_drivers_and_the_emulator(path: Path) ->
         assert not starts(imports(path), "drivers", "firmware_model") - allowed
 
 
-@pytest.mark.parametrize("name", ["loop", "supervisor", "guard", "kernel"])
+@pytest.mark.parametrize("name", ["runtime/loop", "tick/supervisor", "tick/guard", "tick/kernel"])
 def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
     own = starts(imports(ROOT / "hil" / f"{name}.py"), "hil")
     assert own <= starts(
@@ -78,15 +92,29 @@ def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
         "hil.ports",
         "hil.signals",
         "hil.control",
-        "hil.guard",
-        "hil.supervisor",
-        "hil.setpoint",
-        "hil.trouble",
+        "hil.tick.guard",
+        "hil.tick.supervisor",
+        "hil.tick.setpoint",
+        "hil.runtime.trouble",
     )
 
 
+def test_only_these_modules_are_in_no_room() -> None:
+    assert {path.stem for path in (ROOT / "hil").glob("*.py")} == LOOSE
+    rooms = {path.parent.name for path in (ROOT / "hil").glob("*/__init__.py")}
+    assert rooms == set(ROOMS)
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_from_those_before_it(room: str) -> None:
+    above = [f"hil.{name}" for name in ROOMS[ROOMS.index(room) + 1 :]]
+    for path in files(f"hil/{room}"):
+        found = starts(imports(path), *above)
+        assert found == {to for name, to in UPWARD if name == str(path.relative_to(ROOT))}, path
+
+
 def test_nothing_reads_a_clock_but_the_places_that_may() -> None:
-    may = {"clock", "app", "simulate", "ring", "recorder", "writer", "preflight", "check"}
+    may = {"clock", "bus", "session", "simulate", "ring", "recorder", "writer", "preflight", "checks"}
     for path in files("hil"):
         figures = {"paper", "bench", "commands", "faults"} & set(path.parts)  # not control
         if path.stem in may or figures:

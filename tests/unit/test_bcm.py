@@ -13,8 +13,8 @@ from drivers.bcm import STEER_EVERY, TX_DELETE, KernelSync, Steering, kernel_syn
 from drivers.bus import SocketLink
 from drivers.client import DriveClient
 from drivers.errors import LinkError
-from hil.app import Overrides, load_setup
 from hil.errors import ConfigError
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import RxFlag, new_ticks
 from tests.conftest import CONFIGS
 

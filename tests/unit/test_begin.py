@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.cli import main
 from hil.commands.begin import KINDS
 from hil.commands.common import print_json
-from hil.emulate import load_plant
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.emulate import load_plant
 
 
 @pytest.mark.parametrize("like", KINDS)

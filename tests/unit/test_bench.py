@@ -21,7 +21,7 @@ from hil.bench.meter import by_phase, reading_ns
 from hil.bench.processes import awake, seconds_in_time, share_in_time
 from hil.bench.view import ratios, read_result
 from hil.errors import HilError
-from hil.fused import LAST, LOOP, PHASES, SEND, mark, new_marks
+from hil.runtime.fused import LAST, LOOP, PHASES, SEND, mark, new_marks
 from hil.signals import new_ticks
 
 CYCLICTEST = """\

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.convert.readers.recorded import ERROR, EXTENDED, REMOTE, Recorded
-from hil.convert.recording import Recording
+from hil.exchange.readers.recorded import ERROR, EXTENDED, REMOTE, Recorded
+from hil.exchange.recording import Recording
 from hil.log.errors import LogError
 from tests import blf
 

@@ -13,7 +13,6 @@ import pytest
 from scipy.special import ndtri
 
 import hil
-from hil.app import Overrides, load_setup
 from hil.campaign import store
 from hil.campaign.case import job_of, with_settings
 from hil.campaign.figures import longest
@@ -22,11 +21,12 @@ from hil.campaign.normal import between, normal, root
 from hil.campaign.plan import Plan, read_plan
 from hil.campaign.values import distribution, toml
 from hil.cli import main
-from hil.columns import FLOATS, INTEGERS, Columns
 from hil.errors import ConfigError
 from hil.report.build import build
 from hil.report.criteria import figures
-from hil.simulate import simulate
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.columns import FLOATS, INTEGERS, Columns
+from hil.sim.simulate import simulate
 from hil.tuning.bench import bench_of
 from hil.tuning.loop import rigid
 from hil.tuning.measure import margins

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 import hil
-from hil.app import Overrides, load_setup
 from hil.campaign import store, summary
 from hil.cli import main
 from hil.report.build import build
 from hil.report.criteria import figures
-from hil.simulate import simulate
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate
 from tests.conftest import CONFIGS
 
 PLAN = f"""name = "two <laws>"

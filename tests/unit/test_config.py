@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel
 
 from firmware_model.config import PlantConfig
-from hil.config import MAX_CONFIG_BYTES, RunConfig, _tags, load_toml, models_in
+from hil.config.tables import MAX_CONFIG_BYTES, RunConfig, _tags, load_toml, models_in
 from hil.errors import ConfigError
 from tests.conftest import ROOT
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize, minimize_scalar
 
-from hil.config import RunConfig, load_toml
+from hil.config.design import law_spec
+from hil.config.tables import RunConfig, load_toml
 from hil.control.errors import ControlDesignError
 from hil.control.law import (
     LAW_PARAMS,
@@ -23,10 +24,9 @@ from hil.control.law import (
     steady_room,
 )
 from hil.control.mtpa import NEWTON, fits, least_current, operating_point, voltage
-from hil.design import law_spec
 from hil.errors import ConfigError
-from hil.kernel import circle
 from hil.replay.ranges import check_ranges
+from hil.tick.kernel import circle
 from tests.conftest import CONFIGS
 from tests.safety import Guard
 

@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
-from hil.config import RunConfig, load_toml
+from hil.config.design import law_spec
+from hil.config.tables import RunConfig, load_toml
 from hil.control.errors import ControlDesignError
 from hil.control.law import LAW_PARAMS, PI, command, design_law, new_law_state, observe
 from hil.control.laws.lq import lq_gain
 from hil.control.registry import laws, observers
-from hil.design import law_spec
 from hil.errors import ConfigError
-from hil.metrics import operating
 from hil.replay import replay
+from hil.report.metrics import operating
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import Reason
-from hil.simulate import simulate, simulate_ticks
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import CONFIGS
 
 DEMO = CONFIGS / "demo.toml"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from canopen.emcy import EmcyError
 
-from hil.errorcodes import CLASSES, CODES, words
+from hil.tick.errorcodes import CLASSES, CODES, words
 
 
 @pytest.mark.parametrize(

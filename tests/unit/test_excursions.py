@@ -8,15 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.log.reader import open_log
 from hil.report.build import build
 from hil.report.collect import collect
 from hil.report.criteria import figures, judge, notes
 from hil.report.curves import CURVES, values_of
 from hil.report.excursions import Excursions
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import TickArray
-from hil.simulate import simulate, simulate_ticks
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import ROOT
 
 

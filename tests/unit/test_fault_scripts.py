@@ -20,7 +20,7 @@ from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults, project, turned
 from firmware_model.node import wire_of
 from firmware_model.plant import State
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from hil.errors import ConfigError
 from hil.faults.matrix import Matrix, chosen, inline, load_matrix
 from tests.conftest import CONFIGS
@@ -390,8 +390,8 @@ def test_inline_toml_is_read_back(tmp_path: Path) -> None:
 
 
 def test_a_simulation_refuses_a_fault_script(configs: Path) -> None:
-    from hil.app import Overrides, load_setup
-    from hil.simulate import make_simulation
+    from hil.runtime.setup import Overrides, load_setup
+    from hil.sim.simulate import make_simulation
 
     setup = load_setup(configs / "demo.toml", Overrides())
     with pytest.raises(ConfigError, match="needs the bus"):

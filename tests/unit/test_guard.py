@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hil.guard import (
+from hil.signals import DriveState, GuardFlag, Reason
+from hil.tick.guard import (
     inward,
     is_denormal,
     is_frozen,
@@ -19,7 +20,6 @@ from hil.guard import (
     voltage_limit,
     windows_trip,
 )
-from hil.signals import DriveState, GuardFlag, Reason
 from tests.safety import Guard
 
 ANY = st.floats(allow_nan=True, allow_infinity=True)

@@ -6,7 +6,8 @@ import math
 
 import pytest
 
-from hil.guard import (
+from hil.signals import Reason
+from hil.tick.guard import (
     NO_I_D,
     NO_I_Q,
     all_numbers,
@@ -16,7 +17,6 @@ from hil.guard import (
     power_in,
     windows_trip,
 )
-from hil.signals import Reason
 from tests.safety import Guard
 
 NEITHER = NO_I_Q | NO_I_D

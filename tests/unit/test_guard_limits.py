@@ -6,8 +6,9 @@ import math
 
 import pytest
 
-import hil.guard
-from hil.guard import (
+import hil.tick.guard
+from hil.signals import DriveState, GuardFlag, Reason, RxFlag
+from hil.tick.guard import (
     deviates,
     guard_command,
     is_denormal,
@@ -22,7 +23,6 @@ from hil.guard import (
     windows_trip,
     write_command,
 )
-from hil.signals import DriveState, GuardFlag, Reason, RxFlag
 from tests.safety import Guard
 
 LEAST_NORMAL = 2.2250738585072014e-308
@@ -232,8 +232,8 @@ def test_what_is_no_number_is_judged_at_once_and_counts_for_nothing(name: str, v
 
 def test_places_of_the_counts_are_apart() -> None:
     names = ("SPEED", "CURRENT", "TEMPERATURE")
-    places = [getattr(hil.guard, f"OVER_{name}") for name in names]
-    places += [hil.guard.UNDER_VOLTAGE, hil.guard.OVER_VOLTAGE, hil.guard.FOLLOWING]
+    places = [getattr(hil.tick.guard, f"OVER_{name}") for name in names]
+    places += [hil.tick.guard.UNDER_VOLTAGE, hil.tick.guard.OVER_VOLTAGE, hil.tick.guard.FOLLOWING]
     assert len(set(places)) == 6 and max(places) < len(Guard().s[0]["over"])
 
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import hil.guard
-from hil.app import Overrides, Setup, load_setup
+import hil.tick.guard
 from hil.control.jit import jit
-from hil.guard import SAFETY_PARAMS
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import ALL_MISSING, Controlword, DriveState, GuardFlag, Reason, Request, RxFlag, new_ticks
-from hil.supervisor import judge_arming, note_ages
+from hil.tick.guard import SAFETY_PARAMS
+from hil.tick.supervisor import judge_arming, note_ages
 from tests.conftest import ROOT
 from tests.safety import Guard
 
@@ -230,15 +230,15 @@ def test_what_is_counted_is_bounded() -> None:
     guard = Guard()
     guard.t["gap"] = 3_600_000
     for _ in range(2):
-        hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
+        hil.tick.guard.elapse(guard.p[0], guard.s[0], guard.t)
         assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (1024, 1024)
-    assert SAFETY_PARAMS["age_max"].shape == (hil.guard.MOST_MESSAGES,)
+    assert SAFETY_PARAMS["age_max"].shape == (hil.tick.guard.MOST_MESSAGES,)
 
 
 def test_logs_of_before_count_ticks() -> None:
     guard = Guard(rules=0)
     guard.t["gap"] = 5
-    hil.guard.elapse(guard.p[0], guard.s[0], guard.t)
+    hil.tick.guard.elapse(guard.p[0], guard.s[0], guard.t)
     assert (guard.s["elapsed"][0], guard.s["gap"][0]) == (0, 0)
 
 
@@ -246,13 +246,13 @@ def test_logs_of_before_count_ticks() -> None:
 def test_what_another_controller_asks_for_must_be_a_number_where_it_is_read(name: str) -> None:
     """In a shadow run; a log of before, and a run that sends itself, know nothing of it."""
     guard = Guard(shadow=1)
-    assert hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+    assert hil.tick.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
     guard.t[name] = math.nan
-    assert not hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+    assert not hil.tick.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
     for changed in ({"shadow": 0}, {"rules": 0}):
         for key, value in changed.items():
             guard.p[key] = value
-        assert hil.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+        assert hil.tick.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
         guard.p["shadow"] = guard.p["rules"] = 1
 
 
@@ -268,7 +268,7 @@ def test_the_hotter_of_what_is_there(rules: int) -> None:
     found = []
     for motor, inverter in ((40.0, 50.0), (60.0, 50.0), (math.nan, 50.0), (60.0, math.nan)):
         guard.t["temperature_motor"], guard.t["temperature_inverter"] = motor, inverter
-        found.append(hil.guard.hottest(guard.p[0], guard.t))
+        found.append(hil.tick.guard.hottest(guard.p[0], guard.t))
     assert found[:2] == [50.0, 60.0]
     of_before = [larger(math.nan, 50.0), larger(60.0, math.nan)]
     np.testing.assert_equal(found[2:], [50.0, 60.0] if rules else of_before)
@@ -280,14 +280,14 @@ def test_a_measurement_has_come_once_it_was_fresh(rules: int, flags: int) -> Non
     guard = Guard(rules=rules)
     guard.t["rx_flags"] = flags
     note_ages(guard.p[0], guard.s[0], guard.t)
-    assert guard.s["came"][0] == (hil.guard.MEASURED if rules and flags else 0)
+    assert guard.s["came"][0] == (hil.tick.guard.MEASURED if rules and flags else 0)
 
 
 def test_the_first_sight_counts_one_however_long_nothing_was_seen() -> None:
     """Whether it held in between is not known; afterwards time counts, and a tick at least one period."""
-    assert [hil.guard.grown(0, True, periods) for periods in (0, 1, 5)] == [1, 1, 1]
-    assert [hil.guard.grown(3, True, periods) for periods in (0, 1, 5)] == [4, 4, 8]
-    assert hil.guard.grown(3, False, 5) == 0
+    assert [hil.tick.guard.grown(0, True, periods) for periods in (0, 1, 5)] == [1, 1, 1]
+    assert [hil.tick.guard.grown(3, True, periods) for periods in (0, 1, 5)] == [4, 4, 8]
+    assert hil.tick.guard.grown(3, False, 5) == 0
 
 
 @pytest.mark.parametrize("shadow", [0, 1])

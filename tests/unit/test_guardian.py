@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import pytest
 
-from hil.guardian import (
+from hil.runtime.guardian import (
     GUARDIAN_LOST_NS,
     LOOK_NS,
     STOPS,

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import setup_of
-from hil.config import RunConfig, load_toml
+from hil.config.design import law_spec
+from hil.config.tables import RunConfig, load_toml
 from hil.control.errors import ControlDesignError
 from hil.control.law import ROWS, design_law
-from hil.design import law_spec
 from hil.errors import HilError
 from hil.identify.plan import STEPS, Skipped, Step, chosen, config_of, make
 from hil.replay import replay
+from hil.runtime.setup import setup_of
 from hil.signals import Reason, TickArray
-from hil.simulate import simulate, simulate_ticks
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import CONFIGS
 
 DEMO = CONFIGS / "demo.toml"

@@ -17,11 +17,11 @@ import pytest
 from drivers.client import DriveClient
 from drivers.codec import Message
 from drivers.mapping import MEASURED
-from hil.app import Overrides, Setup, load_setup
-from hil.convert.periods import HELD_PERIODS, Heard, periods
-from hil.convert.rerun import FAR_NS, Run, Tape, roles_of
-from hil.convert.search import DEEP_TRIES, TRIES, NotOursError, Search
-from hil.loop import Loop, Plan, StopRequest
+from hil.exchange.periods import HELD_PERIODS, Heard, periods
+from hil.exchange.rerun import FAR_NS, Run, Tape, roles_of
+from hil.exchange.search import DEEP_TRIES, TRIES, NotOursError, Search
+from hil.runtime.loop import Loop, Plan, StopRequest
+from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, DriveState, RxFlag, TickArray, new_ticks
 from tests.conftest import CONFIGS
 

@@ -10,8 +10,9 @@ from contextlib import closing, contextmanager
 
 import pytest
 
-from hil.app import Overrides, load_setup, set_by_others
-from hil.inbox import ASKED, CHECK, CODE, Answer, Inbox, SetpointError, ask, outside
+from hil.runtime.inbox import ASKED, CHECK, CODE, Answer, Inbox, SetpointError, ask, outside
+from hil.runtime.session import set_by_others
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Request
 from tests.conftest import CONFIGS
 

@@ -96,7 +96,8 @@ def test_an_installed_package_keeps_kernels_in_the_users_folder(tree: Path) -> N
 
 
 def test_each_file_that_a_kernel_takes_names_from_is_found() -> None:
-    found = {str(path.relative_to(ROOT)) for path in kernelcache.sources(ROOT / "hil" / "kernel.py")}
-    wanted = {"hil/kernel.py", "hil/guard.py", "hil/supervisor.py", "hil/signals.py", "hil/control/law.py"}
+    found = {str(path.relative_to(ROOT)) for path in kernelcache.sources(ROOT / "hil/tick/kernel.py")}
+    wanted = {f"hil/tick/{name}.py" for name in ("kernel", "guard", "supervisor")}
+    wanted |= {"hil/signals.py", "hil/control/law.py"}
     assert wanted | {"drivers/jit.py", "hil/control/observer.py"} <= found
     assert not any(name.startswith(("hil/report", "hil/commands", "firmware_model")) for name in found)

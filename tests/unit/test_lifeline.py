@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import pytest
 
-from hil.lifeline import BYTES, Lifeline
+from hil.runtime.lifeline import BYTES, Lifeline
 
 FAR_NS = 20_000_000_000
 

@@ -18,7 +18,6 @@ from google.protobuf.message_factory import GetMessageClass
 
 from hil.control.law import LAW_NEUTRAL, LAW_PARAMS, LAW_STATE
 from hil.control.references import REFERENCE, REFERENCE_NEUTRAL
-from hil.guard import SAFETY_NEUTRAL, SAFETY_PARAMS, SAFETY_STATE
 from hil.log.check import first_broken, share, sums
 from hil.log.container import Block, Container
 from hil.log.info import info
@@ -29,8 +28,9 @@ from hil.log.reader import Log, LogError, open_log
 from hil.log.recover import recover
 from hil.log.schema import TYPES, file_descriptor_set
 from hil.replay import replay_log
+from hil.report.view import verdict_text
 from hil.signals import FIELDS, TickArray, tag
-from hil.view import verdict_text
+from hil.tick.guard import SAFETY_NEUTRAL, SAFETY_PARAMS, SAFETY_STATE
 from tests.golden.kept import LOGS
 from tests.logfiles import some_ticks
 

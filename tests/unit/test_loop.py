@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from drivers.errors import EncodeError
-from hil.clock import FakeClock, LockstepClock, RealClock
-from hil.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
+from hil.runtime.clock import FakeClock, LockstepClock, RealClock
+from hil.runtime.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
+from hil.runtime.trouble import QUIET_TICKS
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
-from hil.trouble import QUIET_TICKS
 
 MS = 1_000_000
 

@@ -13,7 +13,7 @@ import pytest
 
 from firmware_model.config import PlantConfig
 from hil.cli import main
-from hil.config import RunConfig, Table, load_toml, put, validate
+from hil.config.tables import RunConfig, Table, load_toml, put, validate
 from hil.errors import ConfigError
 from hil.manual import schema
 from hil.manual.keys import Key, found, tables

@@ -22,12 +22,12 @@ MAY_SEND = {
     ("drivers/lockstep.py", "send"),  # passes on what the client sends
     ("drivers/sdo.py", "send_message"),  # hil configure, and reads before arming: SDO alone
     ("drivers/canopen_node.py", "pre_operational"),  # hil configure: takes a node out of operation
-    ("hil/app.py", "sending_bus"),  # hil play: recorded frames, onto emulated buses unless allowed
+    ("hil/runtime/bus.py", "sending_bus"),  # hil play: recorded frames, onto emulated buses unless allowed
 }
 LINKS = {"drivers/bus.py", "drivers/local.py"}
 NO_CONTROLLER = {"drivers/bare.py"}  # the benchmark's loop without control: refuses what may be a real bus
 # who may ask a drive port to send: the loop, with the tick that the guard has judged, and its wrapper
-MAY_ASK = {("hil/loop.py", "_send"), ("hil/guardian.py", "send")}
+MAY_ASK = {("hil/runtime/loop.py", "_send"), ("hil/runtime/guardian.py", "send")}
 
 
 def sends(path: Path, owner: str) -> set[tuple[str, str]]:
@@ -65,7 +65,7 @@ def test_only_the_client_and_the_compiled_tick_call_the_kernels_that_send() -> N
             if isinstance(node, ast.ImportFrom) and node.module == "drivers.posix":
                 sending = {"command", "exchange", "transmit"} & {alias.name for alias in node.names}
                 callers |= {str(path.relative_to(ROOT))} if sending else set()
-    assert callers == {"drivers/client.py", "drivers/port.py", "hil/fused.py"}
+    assert callers == {"drivers/client.py", "drivers/port.py", "hil/runtime/fused.py"}
 
 
 class Wire:

@@ -14,7 +14,7 @@ import pytest
 
 from hil.campaign.store import Folder, make
 from hil.cli import main
-from hil.outputs import output_folder
+from hil.log.outputs import output_folder
 from tests.conftest import CONFIGS
 from tests.logfiles import some_frames, some_ticks, write_log
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.config import MotorTable, read_toml
-from hil.design import motor_model
+from hil.config.design import motor_model
+from hil.config.tables import MotorTable, read_toml
 from hil.paper.continuous import channel_theta, lag, simulate, theta
 from hil.paper.errata import steady_voltage
 from hil.paper.examples import (

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from hil.cli import main
-from hil.clock import FakeClock
 from hil.commands.play import Keys
-from hil.convert.export import export
+from hil.exchange.export import export
+from hil.exchange.play import LEAD_NS, Choice, Played, Source, ahead, chosen, play
 from hil.log.errors import LogError
 from hil.log.schema import FRAME, Records
-from hil.play import LEAD_NS, Choice, Played, Source, ahead, chosen, play
+from hil.runtime.clock import FakeClock
 from tests.logfiles import some_ticks, write_log
 
 IDS = ((0x080, 0, 1), (0x181, 1, 8), (0x201, 0, 8))

@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, check_reachable, load_setup, run
-from hil.check import reach_rows
+from hil.check.checks import reach_rows
+from hil.config.reachable import is_held, voltage_at
 from hil.errors import ArmingError
-from hil.reachable import is_held, voltage_at
+from hil.runtime.refusals import check_reachable
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 
 CASES = (
     ("reference.w_rad_s=151.0", "limits.w_max_rad_s = 150 stops it"),

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hil import realtime
-from hil.config import RealtimeTable
-from hil.guardian import Rights
-from hil.realtime import keep_off
+from hil.config.tables import RealtimeTable
+from hil.runtime import realtime
+from hil.runtime.guardian import Rights
+from hil.runtime.realtime import keep_off
 
 
 @pytest.fixture

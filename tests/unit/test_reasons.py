@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.log.reader import open_log
-from hil.reasons import CAUSES, explain, page, remedy_of
 from hil.report.collect import collect
 from hil.report.criteria import ending
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import GuardFlag, Reason, new_ticks
-from hil.simulate import simulate
-from hil.supervisor import is_fault
+from hil.sim.simulate import simulate
+from hil.tick.reasons import CAUSES, explain, page, remedy_of
+from hil.tick.supervisor import is_fault
 from tests.conftest import ROOT
 from tests.safety import Guard
 
 
 def test_the_page_is_the_table() -> None:
     written = (ROOT / "docs/stop-reasons.md").read_text(encoding="utf-8")
-    assert written == page(), "write it anew: python -m hil.reasons > docs/stop-reasons.md"
+    assert written == page(), "write it anew: python -m hil.tick.reasons > docs/stop-reasons.md"
 
 
 def test_every_reason_is_explained_and_says_what_to_do() -> None:

@@ -12,9 +12,9 @@ import can
 import numpy as np
 import pytest
 
-from hil.convert.export import export
-from hil.convert.readers.recorded import ERROR, EXTENDED, REMOTE, Recorded
-from hil.convert.recording import Recording, kinds_of
+from hil.exchange.export import export
+from hil.exchange.readers.recorded import ERROR, EXTENDED, REMOTE, Recorded
+from hil.exchange.recording import Recording, kinds_of
 from hil.log.errors import LogError
 from hil.log.schema import FRAME, Records
 from tests.logfiles import some_ticks, write_log
@@ -184,8 +184,8 @@ def test_a_clock_that_stands_still_is_refused(tmp_path: Path) -> None:
 
 def test_asc_in_decimal_and_with_relative_times() -> None:
     """Distances run over every line with a time, of whatever kind."""
-    from hil.convert.readers import asc
-    from hil.convert.readers.recorded import Found
+    from hil.exchange.readers import asc
+    from hil.exchange.readers.recorded import Found
 
     text = (
         "date Fre Mär 27 01:02:03 pm 2026\nbase dec  timestamps relative\n"

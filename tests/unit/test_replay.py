@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.errors import HilError
 from hil.log.reader import open_log
 from hil.replay import Verdict, compare, machine_of, replay, replay_log, replayed
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import INPUTS
-from hil.simulate import simulate
+from hil.sim.simulate import simulate
 
 
 @pytest.fixture(scope="module")

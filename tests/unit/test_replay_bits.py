@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.log.check import first_broken, seal, sums
 from hil.log.mcapfile import RunFile
 from hil.log.reader import Log, open_log
@@ -15,8 +14,9 @@ from hil.log.schema import Records
 from hil.replay import replay, replay_log
 from hil.replay.frames import FrameCheck
 from hil.replay.run import frame_records
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import FIELDS, RxFlag, TickArray, new_ticks
-from hil.simulate import simulate
+from hil.sim.simulate import simulate
 from tests.conftest import CONFIGS
 from tests.golden.kept import LOGS
 from tests.logfiles import some_ticks

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.cli import main
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.errors import HilError
 from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
 from hil.replay import Window, replay
+from hil.replay.whatif import what_if
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Request
-from hil.simulate import simulate
-from hil.whatif import what_if
+from hil.sim.simulate import simulate
 
 CONFIG = Path(__file__).parents[2] / "configs" / "demo.toml"
 

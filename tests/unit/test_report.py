@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup, message_names
 from hil.cli import main
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from hil.errors import ConfigError
 from hil.log.schema import FRAME
 from hil.report.collect import collect
@@ -22,8 +21,10 @@ from hil.report.frames import ERROR, EXTENDED, REMOTE, Frames, id_text
 from hil.report.page import traffic
 from hil.report.segments import Responses, deviation, largest, last_outside
 from hil.report.statistics import Histogram, Spectrum
+from hil.runtime.bus import message_names
+from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, new_ticks
-from hil.simulate import simulate
+from hil.sim.simulate import simulate
 
 SEED = 20261124
 

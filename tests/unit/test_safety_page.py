@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from firmware_model.faults import LinkFault, PlantFault
-from hil.config import load_toml
+from hil.config.tables import load_toml
 from hil.faults.matrix import Host, Matrix, Row
 
 ROOT = Path(__file__).parents[2]

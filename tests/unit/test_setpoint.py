@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
+from hil.config.design import Machine
+from hil.config.setpoint_design import acceleration_max, setpoint_params, stop_rate
 from hil.control.errors import ControlDesignError
 from hil.control.law import FAC
 from hil.control.references import reference_at
-from hil.design import Machine
-from hil.setpoint import (
+from hil.runtime.setup import Overrides, load_setup
+from hil.signals import DriveState, Request, new_ticks
+from hil.sim.simulate import simulate_ticks
+from hil.tick.setpoint import (
     begin_ramp,
     follow,
     new_setpoint_state,
@@ -23,9 +26,6 @@ from hil.setpoint import (
     ramped,
     stepped,
 )
-from hil.setpoint_design import acceleration_max, setpoint_params, stop_rate
-from hil.signals import DriveState, Request, new_ticks
-from hil.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
 OPERATING = int(DriveState.OPERATION_ENABLED)

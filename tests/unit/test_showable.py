@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, load_setup
 from hil.errors import ConfigError
+from hil.runtime.setup import Overrides, load_setup
 
 
 def refused(path: Path, *settings: str) -> list[str]:

@@ -8,11 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from hil.replay.whatif import COMPARED
 from hil.report.curves import CURVES, HEADS, PLOTS, plots_by_field
 from hil.signals import FIELDS, Field, Shown, new_ticks
 from hil.watch.feed import binned, live_plots
 from hil.watch.terminal import curves, lines
-from hil.whatif import COMPARED
 
 SHOWN = [field for field in FIELDS if field.shown.plot]
 NEW = Field(4711, "x_new", "f8", "K", "output", "a new signal", shown=Shown("x_new", "new", live="new"))

@@ -15,10 +15,10 @@ from drivers.codec import Database
 from drivers.dbc import MAX_DBC_BYTES
 from drivers.errors import DatabaseError
 from firmware_model.config import PlantConfig
-from hil.app import plant_of
-from hil.config import MAX_CONFIG_BYTES, RunConfig, load_toml, read_toml
+from hil.config.tables import MAX_CONFIG_BYTES, RunConfig, load_toml, read_toml
 from hil.errors import ConfigError
 from hil.faults.matrix import Matrix
+from hil.runtime.header import plant_of
 from tests.conftest import CONFIGS, ROOT
 
 PACKAGES = ("hil", "drivers", "firmware_model")
@@ -103,7 +103,7 @@ def within(megabytes: int, code: str, *words: str) -> subprocess.CompletedProces
     """Run code in a process that may take so much memory beyond what it has once the packages are loaded."""
     head = (
         "import resource, sys\nfrom pathlib import Path\n"
-        "from drivers.codec import Database\nfrom hil.config import RunConfig, load_toml\n"
+        "from drivers.codec import Database\nfrom hil.config.tables import RunConfig, load_toml\n"
         "from hil.log.reader import open_log\n"
         "size = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()\n"
         f"limit = size + {megabytes << 20}\nresource.setrlimit(resource.RLIMIT_AS, (limit, limit))\n"

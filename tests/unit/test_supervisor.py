@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config import RunConfig, load_toml
-from hil.design import Machine, WireFacts, build
+from hil.config.design import Machine, WireFacts, build
+from hil.config.tables import RunConfig, load_toml
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag, new_ticks
 from tests.conftest import CONFIGS
 
@@ -365,7 +365,7 @@ def test_an_open_phase_stops_at_light_load_too() -> None:
 
 
 def test_a_shadow_run_is_not_stopped_by_what_another_controller_does() -> None:
-    from hil.design import safety_params
+    from hil.config.design import safety_params
 
     config = load_toml(CONFIGS / "demo.toml", RunConfig, ["loop.shadow=true", "limits.i_d_max_a=2.0"])
     p = safety_params(config, WIRE)[0]

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
-from hil.supervisor import (
+from hil.tick.supervisor import (
     STOP_TICKS,
     arming,
     begin_stop,

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from hil.app import Overrides, load_setup
+from hil.campaign.sweep import axis, job_of_sweep
 from hil.cli import main
 from hil.errors import ConfigError
-from hil.simulate import simulate
-from hil.sweep import axis, job_of_sweep
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate
 
 CONFIG = Path(__file__).parents[2] / "configs" / "demo.toml"
 

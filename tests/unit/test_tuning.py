@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.app import Overrides, load_setup
-from hil.check import adaptive_rows
+from hil.check.checks import adaptive_rows
 from hil.cli import main
+from hil.config.design import law_spec
 from hil.control.law import design_law
-from hil.design import law_spec
 from hil.errors import HilError
-from hil.simulate import simulate_ticks
+from hil.runtime.setup import Overrides, load_setup
+from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, seen_in
 from hil.tuning.compare import parse_laws
 from hil.tuning.families import FAMILIES, family, settings_of, toml

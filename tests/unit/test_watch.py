@@ -17,10 +17,10 @@ from rich.console import Console
 
 from hil.log.records import EVENT_BYTES, pack_event_record
 from hil.log.ring import Ring
+from hil.runtime import registry
+from hil.runtime.registry import WatchError, announced, ask_stop, choose, own_entry, runs, who_asked
 from hil.signals import TICK, new_ticks
-from hil.watch import registry
 from hil.watch.look import Look, figures, unpack_events
-from hil.watch.registry import WatchError, announced, ask_stop, choose, own_entry, runs, who_asked
 from hil.watch.terminal import frame, sparkline
 
 
@@ -145,7 +145,7 @@ def ring() -> Iterator[Ring]:
 def now(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The viewer's clock [ns], for the test to set."""
     time_ns = [7_000_000_000]
-    monkeypatch.setattr("hil.clock.RealClock.now_ns", lambda _: time_ns[0])
+    monkeypatch.setattr("hil.runtime.clock.RealClock.now_ns", lambda _: time_ns[0])
     return time_ns
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hil.fused import PHASES
+from hil.runtime.fused import PHASES
 from tests.vm.guest.instructions import BUSES
 from tests.vm.instructions import apart, budget, excess, read, table_of, total_of
 

@@ -18,7 +18,7 @@ from typing import Any
 from hil import cli
 from hil.bench.meter import run_metered
 from hil.bench.pieces import guard_ns
-from hil.config import RunConfig, load_toml
+from hil.config.tables import RunConfig, load_toml
 from tests.vm.guest.process import CONFIG, FD, SCRATCH, Forked
 
 SECONDS = 0.5
@@ -110,7 +110,7 @@ class Bus:
 
 def measure(out: Path) -> None:
     """Everything; a bus that the host has not is left out. What is done is there at once."""
-    from hil.app import Overrides, load_setup
+    from hil.runtime.setup import Overrides, load_setup
 
     found: dict[str, Any] = {"guard": guard_ns(load_setup(Path(CONFIG), Overrides()).machine), "buses": {}}
     for name, (own, *_) in BUSES.items():

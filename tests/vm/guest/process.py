@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from hil import cli
-from hil.config import RunConfig, load_toml
-from hil.emulate import make_node
+from hil.config.tables import RunConfig, load_toml
+from hil.sim.emulate import make_node
 
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
@@ -73,7 +73,8 @@ class Forked:
 
 def warm_up() -> None:
     """Import what a run needs and load its compiled kernels once, before any process is forked."""
-    from hil.app import Overrides, compile_kernels, load_setup
+    from hil.runtime.session import compile_kernels
+    from hil.runtime.setup import Overrides, load_setup
 
     setup = load_setup(Path(CONFIG), Overrides())
     node = make_node(Path(CONFIG), load_toml(Path(CONFIG), RunConfig, ['bus.interface="hil-local"']), [])
@@ -86,8 +87,8 @@ def warm_up() -> None:
 
 def compile_the_rest() -> None:
     """On the host: kernels that single jobs need, so that the machine finds them compiled."""
-    from hil.app import Overrides, load_setup
     from hil.bench.pieces import guard_ns
+    from hil.runtime.setup import Overrides, load_setup
 
     guard_ns(load_setup(Path(CONFIG), Overrides()).machine, 1)
 

@@ -1,0 +1,74 @@
+"""What the drive's filter of its speed does to the loop: margins, noise, and what is refused for it.
+
+The tuning is judged on the linear loop (:mod:`hil.tuning.current`) with the motor that is believed in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from hil.config.design import Machine, inner_loop, motor_model, speed_filter
+from hil.config.tables import RunConfig
+from hil.control.registry import SpeedFilter
+from hil.errors import ConfigError
+
+if TYPE_CHECKING:
+    from hil.tuning.current import Loop
+
+
+def loop_through(config: RunConfig, machine: Machine, given: SpeedFilter | None) -> Loop:
+    """The loop of a drive with a current loop of its own whose speed really comes through ``given``."""
+    from hil.tuning.current import loop_of, shaft_of  # loads scipy
+
+    inner, T_s = inner_loop(config, bool(machine.law["told"][0])), 1.0 / config.loop.rate_hz
+    assert inner is not None  # noqa: S101 - asked of no other drive
+    return loop_of(machine.law, shaft_of(motor_model(config.motor), inner, given, T_s), T_s)
+
+
+def refuse_unstable(where: str, config: RunConfig, machine: Machine, w_lsb: float) -> None:
+    """Raise ConfigError for a filter with which the tuning is not stable, or that leaves nothing but noise.
+
+    ``w_lsb`` [rad/s] is the resolution of the speed in the frames.
+    """
+    table = config.drive.speed_filter
+    given = speed_filter(table, config.loop.rate_hz)
+    if given is None or machine.law["rows"][0]:  # an experiment closes no loop
+        return
+    loop, command = loop_through(config, machine, given), config.command
+    if not loop.stable:
+        raise ConfigError(where, [f"drive.speed_filter: {_unstable(table)}"])
+    noise = loop.u_noise * w_lsb / math.sqrt(12.0)
+    if noise > command.most:
+        raise ConfigError(
+            where,
+            [
+                f"drive.speed_filter: to undo {words(table)} makes {noise:.2g} {command.unit} of noise of "
+                f"the frames' resolution alone, limits allow {command.most:g}; set a faster filter in the "
+                "drive"
+            ],
+        )
+
+
+def _unstable(table: Any) -> str:
+    """What is wrong, and what to do."""
+    if table.modelled:
+        return f"the loop is not stable through {words(table)}; take a lower controller.speed_pole_rad_s"
+    return (
+        f"the loop is not stable through {words(table)}, which the observer does not know; "
+        f"let it: modelled = true, or take a longer delay_ms and a lower controller.speed_pole_rad_s"
+    )
+
+
+def words(table: Any) -> str:
+    """A filter in words."""
+    if table.kind == "first-order":
+        return f"a first-order filter of {table.pole_rad_s:g} rad/s"
+    if table.kind == "pll":
+        return f"a PLL with poles of {table.pole_1_rad_s:g} and {table.pole_2_rad_s:g} rad/s"
+    return "no filter" if table.kind == "none" else f"a moving average of {table.window_ms:g} ms"
+
+
+def known(told: Any) -> str:
+    """A filter in words, and whether the observer knows it."""
+    return f"{words(told)}, which the observer {'knows' if told.modelled else 'does not know'}"

@@ -1,0 +1,327 @@
+"""A tick as one compiled call: what :mod:`hil.runtime.loop` does with its ports, where nothing is unusual.
+
+Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
+long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
+ports. It has no rules of its own: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
+guard :func:`hil.tick.kernel.whole_at`; the command :func:`drivers.posix.command`; the records
+:func:`hil.log.push.push`; the guardian's words as :class:`hil.runtime.guardian.GuardedDrive` keeps them.
+At the first thing that is unusual it returns the stage that it reached, and the loop does the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from drivers.client import FLUSH_AT
+from drivers.drive import Drive
+from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
+from drivers.posix import (
+    COMMANDED,
+    DONE,
+    EAR,
+    EINTR,
+    EXCHANGED,
+    IO,
+    LEFT,
+    MONOTONIC,
+    PENDING,
+    STAMP,
+    STATES,
+    SYNCED,
+    WAITS,
+    clock_ns,
+    command,
+    exchange,
+    follow,
+    now_ns,
+)
+from drivers.posix import HEARD as TAKEN
+from drivers.wire import STATE
+from hil.config.design import Machine
+from hil.log.push import push
+from hil.log.recorder import Recorder
+from hil.runtime.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
+from hil.runtime.loop import (
+    ARRIVED,
+    BEGUN,
+    COUNTER_JUMP,
+    DECIDED,
+    HEARD,
+    MAX_NS,
+    NEVER,
+    NOT_BEGUN,
+    QUEUE_MOST,
+    RECORDED,
+    SENT,
+    STOP,
+    Pace,
+    Plan,
+    Whole,
+    missed,
+    none_compiled,
+    wait_ns,
+)
+from hil.runtime.trouble import TROUBLE
+from hil.signals import ALL_MISSING, TICK
+from hil.tick.kernel import whole_at
+
+PHASES: Final = (
+    "loop", "sleep", "sync, receive, check, decode", "control and guard", "encode, send", "record",
+)  # fmt: skip
+"""Where a tick's processor time goes; ``loop`` is what lies between two calls."""
+LOOP, SLEEP, READ, CONTROL, SEND, RECORD = range(6)
+LAST: Final = len(PHASES)
+"""Behind the phases' sums: the thread's processor time at the last border."""
+Marks = npt.NDArray[np.int64]
+"""Each phase's processor time [ns], added up, and :data:`LAST`."""
+
+_types: Any = numba.types
+_clock_nanosleep = _types.ExternalFunction(
+    "clock_nanosleep", _types.int32(_types.int32, _types.int32, _types.uintp, _types.uintp)
+)
+THREAD_CPUTIME, ABSOLUTE = 3, 1
+I8: Final = np.dtype(np.int64)
+
+RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, ROWS = range(12)
+"""Rows of the table: places of the kernels' own tables of places, then of arrays."""
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS = range(5)
+
+
+def whole_tick(
+    client: Drive,
+    words: Words | None,
+    machine: Machine,
+    recorder: Recorder,
+    plan: Plan,
+    pace: Pace,
+    marks: Marks | None = None,
+) -> Whole:
+    """The tick of a run on a socket, paced by SYNC or feedback in real time; another is the loop's alone.
+
+    The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
+    """
+    ports = client.compiled()
+    receive = None if ports is None else {"sync": ports.exchange, "feedback": ports.follow}.get(plan.pacing)
+    if ports is None or receive is None:
+        return none_compiled
+    end = NEVER if plan.ticks is None else plan.ticks
+    timing = np.array(
+        [plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None)]
+    )
+    shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
+    marks = np.zeros(0, np.int64) if marks is None else marks
+    tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
+    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks, pace]
+    rows = [place_of(table.reshape(-1), I8) for table in tables]
+    rows += [place_of(array, TICK if array is recorder.record else I8) for array in arrays]
+    call = partial(_compiled(run_tick if plan.pacing == "sync" else run_followed), np.array(rows))
+    call.__dict__["alive"] = (client, machine, recorder, tables, arrays)  # the places are of them
+    return call
+
+
+def _compiled(kernel: Any) -> Callable[..., int]:
+    """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
+    table = np.zeros((ROWS, 2), np.int64)
+    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(WAIT_NS + 1, np.int64)}
+    for row, array in known.items():
+        table[row] = place_of(array, I8)
+    compiled: Callable[..., int] = entry(kernel, table, 0, 0, 0, False)
+    return compiled
+
+
+def new_marks() -> Marks:
+    """All zero."""
+    return np.zeros(LAST + 1, np.int64)
+
+
+def load(pacing: str) -> None:
+    """Compile it, or load it."""
+    if COMPILED:
+        _compiled(run_tick if pacing == "sync" else run_followed)
+
+
+@jit
+def mark(marks: Any, phase: int, times: Any) -> None:
+    """Add what the thread took since the last border to a phase."""
+    if len(marks) > 0:
+        ns = clock_ns(THREAD_CPUTIME, times)
+        marks[phase] += ns - marks[LAST]
+        marks[LAST] = ns
+
+
+@jit
+def mark_often(marks: Any, count: int) -> None:
+    """So many borders of nothing, for what one takes."""
+    times = np.zeros(4, np.int64)
+    for _ in range(count):
+        mark(marks, LOOP, times)
+
+
+@jit
+def sleep_until(deadline_ns: int, times: Any) -> Any:
+    """Sleep to the absolute deadline, or to a signal; return the time of waking."""
+    woken_ns = now_ns(times)
+    while woken_ns < deadline_ns:
+        times[2], times[3] = deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000
+        failed = _clock_nanosleep(MONOTONIC, ABSOLUTE, times[2:].ctypes.data, 0)
+        woken_ns = now_ns(times)
+        if failed == EINTR:
+            break
+    return woken_ns
+
+
+@jit
+def since(deadline_ns: int, times: Any) -> Any:
+    """Time after the deadline, as the record holds it."""
+    return min(now_ns(times) - deadline_ns, MAX_NS)
+
+
+@jit
+def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_failed: bool) -> None:
+    """The fields of a tick that is neither late nor the first after others that were skipped."""
+    t["k"], t["t_ns"], t["lateness_ns"] = k, deadline_ns, woken_ns - deadline_ns
+    t["gap"], t["skipped"], t["rx_flags"], t["missing"] = 1, 0, 0, ALL_MISSING
+    t["request"], t["log_failed"] = asked, log_failed
+
+
+@jit
+def read(table: Any, t: Any, deadline_ns: int) -> Any:
+    """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
+    words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
+    places, times = places_at(table, RECEIVE), array_at(table, TIMES_AT, I8)
+    io = array_at(places, IO, I8)
+    if len(words) > 0:
+        words[BEAT_NS] = now_ns(times)
+        if words[FIRED] != 0:
+            return NOT_BEGUN
+    code = exchange(places, plan[SYNC_BYTES], deadline_ns + plan[TIMEOUT_NS])
+    if code == PENDING:
+        return NOT_BEGUN
+    if code != DONE:
+        io[EXCHANGED] = code
+        return BEGUN
+    if len(words) > 0:
+        t["rx_flags"] |= guardian_flags(words)
+    return DECIDED
+
+
+@jit
+def answer(table: Any, t: Any) -> Any:
+    """The command, if there is one. Returns the stage reached: SENT when the loop has nothing to send."""
+    words, places = array_at(table, WORDS, I8), places_at(table, COMMAND)
+    times, io = array_at(table, TIMES_AT, I8), array_at(places, IO, I8)
+    if t["send"] == 0:
+        return SENT
+    if len(words) > 0:
+        words[BEAT_NS] = now_ns(times)
+        words[ARMED], words[COUNTER] = int(t["state"] != DISARMED), t["counter"]
+        if words[FIRED] != 0:
+            return DECIDED
+    code = command(places)
+    if code != DONE:
+        io[COMMANDED] = code
+        return DECIDED
+    return SENT
+
+
+@jit
+def hand_on(table: Any) -> None:
+    """Frames into their ring, some ticks' together."""
+    state = array_at(places_at(table, RECEIVE), STATES, STATE)
+    if state[0]["logged"] >= FLUSH_AT:
+        push(places_at(table, FRAMES_IN), state[0]["logged"])
+        state[0]["logged"] = 0
+
+
+@waiting
+def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
+    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.loop` that it reached."""
+    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
+    mark(marks, LOOP, times)
+    woken_ns = sleep_until(deadline_ns, times)
+    mark(marks, SLEEP, times)
+    late_ns = woken_ns - deadline_ns
+    if late_ns < 0 or late_ns >= array_at(table, PLAN, I8)[PERIOD_NS]:
+        return NOT_BEGUN
+    ticks = array_at(table, TICK_AT, TICK)
+    t = ticks[0]
+    request = t["request"]
+    stamp(t, k, deadline_ns, woken_ns, asked, log_failed)
+    stage = read(table, t, deadline_ns)
+    mark(marks, READ, times)
+    if stage < DECIDED:
+        return stage
+    return conclude(table, ticks, deadline_ns, request)
+
+
+@jit
+def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
+    """Law, command and record of a tick whose feedback was waited for; ``request``: the last tick's."""
+    times, marks, t = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8), ticks[0]
+    t["received_ns"] = since(deadline_ns, times)
+    state = t["state"]
+    whole_at(places_at(table, LAW), ticks)
+    t["computed_ns"] = since(deadline_ns, times)
+    mark(marks, CONTROL, times)
+    stage = answer(table, t)
+    if stage < SENT:
+        return stage
+    t["sent_ns"] = since(deadline_ns, times)
+    mark(marks, SEND, times)
+    hand_on(table)
+    if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state or t["request"] != request:
+        return SENT
+    push(places_at(table, TICKS_IN), 1)
+    t["recorded_ns"] = since(deadline_ns, times)
+    mark(marks, RECORD, times)
+    return RECORDED
+
+
+@jit
+def heard(table: Any, t: Any, k: int, deadline_ns: int, asked: int, count: int) -> Any:
+    """Stamp a tick that feedback woke as the loop in Python does; return its deadline, maybe a later one."""
+    plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
+    now, period_ns = now_ns(array_at(table, TIMES_AT, I8)), plan[PERIOD_NS]
+    jumped, ear = int(t["rx_flags"] & np.uint32(COUNTER_JUMP)), array_at(places_at(table, RECEIVE), EAR, I8)
+    if len(ear) > 0:
+        count, jumped, ear[SYNCED] = ear[SYNCED], 0, 0
+        now = ear[STAMP] if count > 0 else now
+    late_ns = now - pace[ARRIVED] - period_ns
+    skipped = missed(count, jumped, late_ns, period_ns)
+    k, deadline_ns = k + skipped, deadline_ns + skipped * period_ns
+    expected_ns = pace[ARRIVED] + (1 + skipped) * period_ns
+    pace[ARRIVED] = now if count > 0 else expected_ns
+    t["k"], t["t_ns"], t["gap"], t["skipped"] = k, deadline_ns, 1 + skipped, skipped
+    t["lateness_ns"] = min(max(now - expected_ns, -MAX_NS), MAX_NS)
+    t["request"] = max(asked, STOP) if k >= plan[END] else asked
+    return deadline_ns
+
+
+@waiting
+def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
+    """:func:`run_tick` for a tick that begins when the drive's cyclic feedback comes."""
+    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
+    mark(marks, LOOP, times)
+    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
+    if k == 0 or (len(words) > 0 and words[FIRED] != 0):
+        return NOT_BEGUN
+    pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
+    t = ticks[0]
+    request = t["request"]
+    stamp(t, k, deadline_ns, deadline_ns, asked, log_failed)
+    count = follow(places, pace[ARRIVED] + plan[WAIT_NS], QUEUE_MOST)
+    mark(marks, READ, times)
+    if count == WAITS:
+        return NOT_BEGUN
+    if count == LEFT:
+        pace[HEARD] = array_at(places, IO, I8)[TAKEN]
+        return BEGUN
+    if len(words) > 0:
+        t["rx_flags"] |= guardian_flags(words)
+    return conclude(table, ticks, heard(table, t, k, deadline_ns, asked, count), request)

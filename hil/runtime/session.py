@@ -1,0 +1,314 @@
+"""A run from start to end: alone on its bus, guarded, recorded, armed; every way out without torque."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from typing import Any
+
+from drivers.client import precompile
+from drivers.drive import Drive as BusDrive
+from drivers.drive import drive_kind
+from drivers.errors import DriverError, LinkError
+from drivers.watch import CommandWatch
+from hil.config.design import Machine
+from hil.config.tables import RunConfig
+from hil.errors import ArmingError, HilError
+from hil.log.recorder import Recorder, check_folder
+from hil.ports import Drive
+from hil.runtime import fused, realtime
+from hil.runtime.bus import is_emulated_bus, new_client, note_interface, opened_client
+from hil.runtime.claim import ClaimedError, claimed
+from hil.runtime.clock import LockstepClock, RealClock
+from hil.runtime.guardian import GuardedDrive, Rights, Words, guardian
+from hil.runtime.header import header_of, log_path
+from hil.runtime.inbox import Inbox, ranges
+from hil.runtime.loop import Loop, Outcome, Plan, StopRequest, no_whole
+from hil.runtime.progress import say, watching
+from hil.runtime.refusals import check_arming, check_load, check_reachable, check_set_up, needed_bytes
+from hil.runtime.registry import announced, own_entry, who_asked
+from hil.runtime.setup import Setup
+from hil.runtime.shadow import ShadowDrive
+from hil.signals import Reason, new_ticks
+from hil.tick.errorcodes import words
+from hil.tick.reasons import End, explain
+
+LISTEN_PERIODS, LISTEN_S = 5, 0.05
+"""How long a run listens for another controller: so many of its own periods, and at least that long."""
+ANOTHER_REMEDY = "stop it, take another bus.channel, or only look: loop.shadow, hil watch"
+
+
+@dataclass(slots=True)
+class RunResult:
+    """What a run was, for people and for ``--json``."""
+
+    log: str
+    outcome: Outcome
+    complete: bool
+    dropped: int
+    grants: list[realtime.Grant] = field(default_factory=list)
+    processor_us: float = 0.0
+    """Processor time of the loop's thread, per tick [us]."""
+    end: End | None = None
+    """Why it ended; None when it did not get so far."""
+
+    @property
+    def ok(self) -> bool:
+        """True when the run ended by request and lost nothing."""
+        asked = self.outcome.reason in (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED)
+        return asked and self.complete and self.dropped == 0
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "log": self.log,
+            "ticks": self.outcome.ticks,
+            "skipped": self.outcome.skipped,
+            "ended": Reason(self.outcome.reason).name.lower(),
+            "end": self.end.as_dict() if self.end else None,
+            "dropped": self.dropped,
+            "log_complete": self.complete,
+            "processor_us": self.processor_us,
+            "grants": [asdict(grant) for grant in self.grants],
+            "ok": self.ok,
+        }
+
+
+def compile_kernels(setup: Setup) -> None:
+    """Compile, or load, what a run needs: that takes longer than anything later waits for."""
+    setup.machine.looped()
+    fac = setup.config.controller.kind == "fac"
+    opens = drive_kind(setup.config.drive.kind).open
+    precompile(setup.database, setup.binding.map, fac, new_ticks()[0], opens)
+    fused.load(plan_of(setup.config).pacing)
+
+
+def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
+    """Arm and run a configuration; returns after a safe stop. Raises HilError before anything is sent."""
+    check_arming(setup, arm)
+    check_reachable(setup)
+    check_load(setup)
+    request = request or StopRequest()
+    config = setup.config
+    path = log_path(setup, "run")
+    check_folder(path, needed_bytes(config))
+    clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
+    with _alone(setup), _writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
+        compile_kernels(setup)  # while the writer starts
+        check_set_up(setup)
+        with _guarding(setup, recorder) as words:
+            return _recorded(setup, request, recorder, clock, words)
+
+
+@contextlib.contextmanager
+def _writing(recorder: Recorder) -> Iterator[Recorder]:
+    """A log that says of a run that was refused why."""
+    try:
+        yield recorder
+    except (LinkError, DriverError, HilError) as error:
+        recorder.close({"ended": f"refused: {error}"})
+        raise
+
+
+@contextlib.contextmanager
+def _alone(setup: Setup) -> Iterator[None]:
+    """No other process of this machine may send what this run sends. Raises ArmingError."""
+    binding, bus = setup.binding, setup.config.bus
+    sent = [bound.message for bound in binding.outgoing] + ([binding.sync] if binding.sync else [])
+    names = [] if setup.config.loop.shadow else [f"0x{message.send_id:X}" for message in sent]
+    try:
+        with claimed(bus.interface, bus.channel, names):
+            yield
+    except ClaimedError as error:
+        raise ArmingError(f"nothing was sent: {error}; to look on: hil watch, --shadow") from error
+
+
+@contextlib.contextmanager
+def _guarding(setup: Setup, recorder: Recorder) -> Iterator[Words | None]:
+    """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own."""
+
+    def client() -> BusDrive:
+        recorder.leave()
+        return new_client(setup)
+
+    config = setup.config
+    loop, alone = config.loop, config.bus.interface == "virtual"
+    if alone or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
+        yield None
+    else:
+        timeout_ns, asked = config.guardian.timeout_ns(loop), config.realtime
+        rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
+        with guardian(timeout_ns, rights, client) as words:
+            yield words
+
+
+def _recorded(
+    setup: Setup,
+    request: StopRequest,
+    recorder: Recorder,
+    clock: RealClock | LockstepClock,
+    words: Words | None,
+) -> RunResult:
+    """Open the drive and the log, arm, run."""
+    config = setup.config
+    watch = CommandWatch(setup.binding) if config.loop.shadow else None
+    with opened_client(setup, recorder, clock, watch) as client:
+        recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
+        asked = not watch and drive_kind(config.drive.kind).asked
+        if asked:  # who asks has listened
+            _hear_others(setup, client)
+        if watch or not setup.binding.map.poll:
+            say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
+            _await_drive(setup, client, asked)
+        if not (watch or asked):
+            _hear_others(setup, client)
+        recorder.await_open()
+        say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
+        drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
+        if words:
+            drive = GuardedDrive(client, words, clock.now_ns, client.timed)
+        if watch:
+            recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
+        machine, plan = setup.machine.fresh(), plan_of(config)
+        machine = machine if request.ramps else machine.at_once()
+        alone = watch is not None or clock.name != "monotonic"
+        whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
+        takes = set_by_others(setup)
+        with contextlib.closing(Inbox(machine, takes)) as inbox, _started(None if watch else client):
+            parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
+            loop = Loop(*parts, inbox if takes else None, client.timed)
+            client.discard()
+            return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client)
+
+
+@contextlib.contextmanager
+def _started(client: BusDrive | None) -> Iterator[None]:
+    """The drive's CANopen node in operation, where it has one; every way out leaves it. None: a shadow."""
+    if client is None:
+        yield
+        return
+    client.start()
+    try:
+        yield
+    finally:
+        client.leave()
+
+
+def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
+    """What ``hil set`` may ask of this run: nothing when the config says so, or when it sends nothing."""
+    config = setup.config
+    if config.loop.shadow or not config.setpoint.enabled:
+        return {}
+    return ranges(setup.machine, config.controller.kind)
+
+
+def _await_drive(setup: Setup, client: BusDrive, ask: bool = False) -> None:
+    """Listen for the drive before anything is sent; ``ask``: for what it measures, which commands nothing."""
+    timeout_s = setup.config.drive.heartbeat_timeout_s
+    if not client.wait_for_drive(timeout_s, ask):
+        bus = setup.config.bus
+        hint = (
+            f"start it: hil emulate {setup.path}"
+            if is_emulated_bus(setup.config)
+            else "is it powered and wired?"
+        )
+        sent = "no command" if ask else "nothing"
+        raise ArmingError(
+            f"no drive heard on {bus.interface}:{bus.channel} for {timeout_s:g} s, {sent} was sent; {hint}"
+        )
+    if odd := client.odd_length():
+        raise ArmingError(f"{odd}; correct the DBC, or the drive's mapping; nothing was sent")
+
+
+def _hear_others(setup: Setup, client: BusDrive) -> None:
+    """Listen for another controller, on this machine or not, before anything is sent. Raises ArmingError."""
+    heard = client.other_master(max(LISTEN_PERIODS * setup.config.loop.period_ns * 1e-9, LISTEN_S))
+    if heard is not None:
+        bus = setup.config.bus
+        raise ArmingError(
+            f"another controller sends 0x{heard:X} on {bus.interface}:{bus.channel}: nothing was sent; "
+            f"{ANOTHER_REMEDY}"
+        )
+
+
+def plan_of(config: RunConfig) -> Plan:
+    """Timing of the run."""
+    loop = config.loop
+    ticks = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
+    follows = loop.pacing == "sync" and (loop.shadow or config.bus.sync == "kernel")
+    pacing = "feedback" if follows else loop.pacing
+    return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks)
+
+
+def _run_armed(
+    setup: Setup,
+    machine: Machine,
+    loop: Loop,
+    plan: Plan,
+    recorder: Recorder,
+    clock: RealClock | LockstepClock,
+    request: StopRequest,
+    takes: dict[str, tuple[float, float, float]],
+    client: BusDrive,
+) -> RunResult:
+    grants: list[realtime.Grant] = []
+    outcome, failure, processor_ns = Outcome(), "", 0
+    try:
+        with stopping_on_signals(request):
+            note_interface(setup.config, recorder, clock.now_ns(), 0)
+            if clock.name == "monotonic":
+                realtime.keep_off(recorder.writer_pid, setup.config.realtime.cpu)
+                grants = realtime.acquire(setup.config.realtime)
+            bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
+            where = f"{bus.interface}:{bus.channel}"
+            entry = own_entry(recorder.path, where, rate_hz, plan.ticks, clock.name, takes)
+            with announced(entry), watching(os.getpid(), plan.ticks):
+                begin_ns = time.thread_time_ns()
+                outcome = loop.run()
+                processor_ns = time.thread_time_ns() - begin_ns
+    except BaseException as error:
+        failure = f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        realtime.release()
+        note_interface(setup.config, recorder, clock.now_ns(), outcome.ticks + outcome.skipped)
+        if asked := who_asked(os.getpid()):
+            t_ns, k, who = asked
+            recorder.event(t_ns, k, "stop-asked", who)
+        if odd := client.odd_length():
+            recorder.event(clock.now_ns(), outcome.ticks + outcome.skipped, "length", odd)
+            say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
+        with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
+            client.flush()
+        dropped = recorder.dropped
+        ended = failure or Reason(outcome.reason).name.lower()
+        result: dict[str, Any] = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
+        stop = outcome.stop
+        end = None if stop is None else explain(machine.safety, machine.safety_state, stop[0])
+        if end is not None:
+            result["end"] = end.as_dict()
+        if stop is not None and (code := int(stop[0]["drive_error"])):
+            recorder.event(clock.now_ns(), int(stop[0]["k"]), "drive-error", words(code))
+        complete = recorder.close(result)
+        if not complete:
+            kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"
+            say(f"log {recorder.path} is not complete{kept}")
+    processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
+    return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us, end)
+
+
+@contextlib.contextmanager
+def stopping_on_signals(request: StopRequest) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and SIGHUP ask for a safe stop; the old handlers come back afterwards."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, request.stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,1 @@
+"""Without a real drive: the emulator's process, the compiled simulation, and the demo."""
