@@ -199,6 +199,19 @@ def test_the_d_current_counts_up_and_down(sign: float) -> None:
     assert got == [(Reason.CURRENT_UNCONTROLLED if n >= 3 else 0, n) for n in counts]
 
 
+@pytest.mark.parametrize(
+    ("ticks", "elapsed", "counts"),
+    [(1, 5, 1), (2, 5, 1), (3, 5, 1), (4, 5, 2), (9, 5, 4), (9, 3, 3), (9, 0, 1)],
+)
+def test_one_measurement_after_a_gap_fills_at_most_half_the_count(
+    ticks: int, elapsed: int, counts: int
+) -> None:
+    guard = bench(i_d_max=2.0, w_error_ticks=ticks)
+    guard.s["elapsed"], guard.t["i_d"] = elapsed, 3.0
+    ask(judge_following, guard)
+    assert guard.s["uncontrolled"][0] == counts
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("i_q", "i_d", "counts"),
