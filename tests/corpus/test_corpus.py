@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hil.convert.export import export
-from hil.convert.importing import import_recording
-from hil.convert.readers.recorded import Recorded
-from hil.convert.recording import ENDINGS, Recording, kinds_of
 
+from hil.exchange.export import export
+from hil.exchange.importing import import_recording
+from hil.exchange.readers.recorded import Recorded
+from hil.exchange.recording import ENDINGS, Recording, kinds_of
 from hil.log.errors import LogError
 from tests.conftest import CONFIGS
 
