@@ -19,7 +19,7 @@ from tests.unit.test_control_registry import LAWS, OBSERVERS
 SCRIPT = """
 import sys
 from pathlib import Path
-from hil.runtime.session import Overrides, load_setup
+from hil.runtime.setup import Overrides, load_setup
 from tests.unit.test_control_registry import LAWS, OBSERVERS, config_of, settings
 asked = [("demo", 500, ()), ("demo", 5000, ()), ("paper", 1000, ()), ("inverter", 1000, ())]
 asked += [("demo", 1000, settings(observer=kind)) for kind in OBSERVERS]

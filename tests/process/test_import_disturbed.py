@@ -32,7 +32,8 @@ ESTIMATES = {"d_hat_w", "d_hat_q", "d_hat_d", "T_L_hat", "filled"}
 RUN = """
 import json, sys
 from pathlib import Path
-from hil.runtime.session import Overrides, load_setup, run
+from hil.runtime.session import run
+from hil.runtime.setup import Overrides, load_setup
 print(json.dumps(run(load_setup(Path(sys.argv[1]), Overrides(settings=tuple(sys.argv[2:])))).log))
 """
 STOPS = """
