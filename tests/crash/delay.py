@@ -26,7 +26,8 @@ from tests.crash.witness import Delay, Witness, above_all, within_ms, witness
 
 SO_TIMESTAMPNS, STAMP = 35, struct.Struct("=qq")
 COMMAND, SYNC = 0x201, 0x080
-BOUND_MS = 2.0
+BOUND_MS, MOST_MS = 2.0, 5.0
+"""What the 99th percentile keeps, and every single stop: a quarter of the drive's watchdog."""
 OWN_MS = 1.0
 """So long the loop's own end may keep a core from others (0.9 ms seen): no excuse for the guardian."""
 WATCHDOG_MS = 20.0
@@ -202,8 +203,10 @@ def spread(values: list[float]) -> str:
 def verdict(done: list[Stop], count: int) -> tuple[bool, str]:
     """Whether all is as it should be, and what was found: a line, and one for each kill that was not.
 
-    No stop frame may be late, and no drive may end in its watchdog, but for a host that itself stood still so
-    long. Without the right to FIFO or to lock memory the time is said, not judged, and the control, which has
+    The 99th percentile is judged: one stop frame of a hundred, or of ten and more, may be later than
+    BOUND_MS, none than MOST_MS. No drive may end in its watchdog. A host that itself stood still so long is
+    an excuse.
+    Without the right to FIFO or to lock memory the time is said, not judged, and the control, which has
     no more rights, excuses nothing.
     """
     if not done:
@@ -223,4 +226,6 @@ def verdict(done: list[Stop], count: int) -> tuple[bool, str]:
         f"{len(faults) - len(tripped)}"
     )
     odd = [stop for stop in done if stop in slow or stop in faults]
-    return len(done) == count and not late and not tripped, "\n".join([line, *map(str, odd)])
+    spared = count // 100 or int(count >= 10)
+    in_time = len(late) <= spared and all(stop.after_ms < MOST_MS for stop in late)
+    return len(done) == count and in_time and not tripped, "\n".join([line, *map(str, odd)])
