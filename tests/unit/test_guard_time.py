@@ -256,6 +256,20 @@ def test_what_another_controller_asks_for_must_be_a_number_where_it_is_read(name
         guard.p["shadow"] = guard.p["rules"] = 1
 
 
+@pytest.mark.parametrize(
+    ("place", "name"), list(enumerate(("v_dc", "temperature_motor", "temperature_inverter")))
+)
+def test_what_has_come_must_be_a_number_and_what_has_not_is_absent(place: int, name: str) -> None:
+    guard = Guard()
+    guard.p["carried_by"][0] = 1, 2, 4
+    guard.t["v_dc"], guard.t["temperature_motor"], guard.t["temperature_inverter"] = 500.0, 25.0, 25.0
+    guard.t[name] = math.nan
+    for came in range(8):
+        guard.s["came"] = came
+        numbers = hil.tick.guard.all_numbers(guard.p[0], guard.s[0], guard.t)
+        assert numbers is not bool(came & 1 << place), came
+
+
 @jit
 def larger(a: float, b: float) -> float:
     """What the compiler, or the interpreter, makes of max: with NaN each something else."""

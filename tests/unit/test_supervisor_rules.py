@@ -321,9 +321,9 @@ def test_which_stops_are_faults(reason: Reason) -> None:
     assert (guard.s["stale"][0], guard.s["stale_at"][0]) == (5, 5), "how old the feedback was is told later"
 
 
-def shake(drive: DriveState, armed: int = 1, flags: int = FRESH) -> tuple[int, int, int]:
+def shake(drive: DriveState, armed: int = 1, flags: int = FRESH, **changed: float) -> tuple[int, int, int]:
     """Controlword, state and run ticks after one tick of the handshake."""
-    guard = bench()
+    guard = bench(**changed)
     guard.s["state"], guard.s["armed_ticks"] = int(DriveState.READY_TO_SWITCH_ON), armed
     guard.s["word"], guard.s["run_ticks"] = 0x55, 77
     guard.t["drive_state"], guard.t["rx_flags"] = int(drive), flags
@@ -351,6 +351,19 @@ def test_the_handshake_by_the_drives_state(
 ) -> None:
     assert shake(drive) == (word, state, run_ticks)
     assert shake(drive, armed=5) == (word, state, run_ticks)
+
+
+@pytest.mark.parametrize(
+    ("drive", "word"),
+    [
+        (DriveState.SWITCH_ON_DISABLED, Controlword.SHUTDOWN),
+        (DriveState.FAULT, Controlword.FAULT_RESET),
+        (DriveState.SWITCHED_ON, Controlword.SWITCH_ON),
+        (DriveState.OPERATION_ENABLED, Controlword.SWITCH_ON),
+    ],
+)
+def test_no_drive_is_enabled_before_each_slow_message_has_come(drive: DriveState, word: Controlword) -> None:
+    assert shake(drive, messages=2) == (word, READY, 77)
 
 
 def test_a_fault_is_reset_by_turns() -> None:
