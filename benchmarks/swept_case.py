@@ -8,6 +8,7 @@ before them what `hil simulate --sweep` did for each case. The fastest of many.
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import sys
@@ -36,11 +37,8 @@ def of_campaign(config: Path, folder: Path) -> Callable[[int], Any]:
 
 def of_sweep(config: Path) -> Callable[[int], Any]:
     """A case of the sweep that was there before campaigns."""
-    import hil.campaign.sweep
-    from hil.runtime.setup import Overrides
-
-    sweep: Any = hil.sweep
-    overrides = Overrides(settings=(f"loop.duration_s={SECONDS}",))
+    sweep, app = importlib.import_module("hil.sweep"), importlib.import_module("hil.app")
+    overrides = app.Overrides(settings=(f"loop.duration_s={SECONDS}",))
 
     def run(case: int) -> Any:
         own = sweep.Case((), (f"motor.J_kg_m2={0.010 + 1e-5 * case}",))
