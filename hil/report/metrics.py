@@ -78,12 +78,16 @@ def find_step(ticks: TickArray, at_least: float = 0.5) -> int | None:
     return row if jump[row - 1] >= at_least else None
 
 
+def torque(motor: MotorModel, i_q: Any, i_d: Any) -> Any:
+    """1.5 n_p (psi_f i_q + (L_d - L_q) i_d i_q) [N m] of currents [A]."""
+    return 1.5 * motor.n_p * (motor.psi_f + (motor.L_d - motor.L_q) * i_d) * i_q
+
+
 def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -> npt.NDArray[np.float64]:
-    """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed linear model's."""
+    """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed model's, c(x) included."""
     w, i_q, i_d = ticks["w"], ticks["i_q"], np.nan_to_num(ticks["i_d"])  # not reported: held at zero
-    torque = 1.5 * true.n_p * (true.psi_f + (true.L_d - true.L_q) * i_d) * i_q
-    real = (torque - ticks["T_L_true"] - true.B_f * w) / true.J
-    out: npt.NDArray[np.float64] = real - (believed.k_t * i_q - believed.B_f * w) / believed.J
+    real = (torque(true, i_q, i_d) - ticks["T_L_true"] - true.B_f * w) / true.J
+    out: npt.NDArray[np.float64] = real - (torque(believed, i_q, i_d) - believed.B_f * w) / believed.J
     return out
 
 

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from hil.control.law import exact_after
 from hil.control.mtpa import operating_point
-from hil.report.metrics import operating
+from hil.report.metrics import load_step, operating
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import GuardFlag, Reason, TickArray
+from hil.sim.demo import motor_model
 from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 from tests.contract.lockstep import held_in_lockstep
@@ -94,6 +96,16 @@ def test_the_point_is_that_of_the_plants_own_motor_when_it_is_known() -> None:
     assert not capped
     assert own["i_d"].mean() == pytest.approx(i_d, abs=0.03)
     assert own["i_q"].mean() == pytest.approx(i_q, abs=0.01)
+
+
+def test_the_estimate_is_judged_with_the_reluctance_torque_that_the_model_knows() -> None:
+    setup = load_setup(PATH, Overrides())
+    own, N = motor_model(setup.config.motor), exact_after(setup.machine.law)[0]
+    step = load_step(
+        simulated((*MATCHED, "friction.coulomb_n_m=0.0", "friction.static_n_m=0.0")), N, own, own
+    )
+    assert step is not None and abs(step.step) > 400.0
+    assert step.estimate_error < 0.005 * abs(step.step)  # i_d i_q is held over a tick
 
 
 @pytest.mark.parametrize(
