@@ -84,7 +84,7 @@ def torque(motor: MotorModel, i_q: Any, i_d: Any) -> Any:
 
 
 def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -> npt.NDArray[np.float64]:
-    """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed model's, c(x) included."""
+    """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed model's with c(x)."""
     w, i_q, i_d = ticks["w"], ticks["i_q"], np.nan_to_num(ticks["i_d"])  # not reported: held at zero
     real = (torque(true, i_q, i_d) - ticks["T_L_true"] - true.B_f * w) / true.J
     out: npt.NDArray[np.float64] = real - (torque(believed, i_q, i_d) - believed.B_f * w) / believed.J
