@@ -14,7 +14,7 @@ from typing import Any, Final
 from drivers.codec import Database
 from drivers.errors import DatabaseError
 from drivers.oneshot import OneShot, shots_from
-from drivers.units import CELSIUS, CURRENT, DRIVE_TORQUE, SPEED, TORQUE, VOLTAGE
+from drivers.units import ANGLE, CELSIUS, CURRENT, DRIVE_TORQUE, SPEED, TORQUE, VOLTAGE
 
 PLAIN: Final[dict[str, float]] = {}
 STATUSWORD: Final = "statusword"
@@ -46,6 +46,7 @@ RECEIVED: Final[dict[str, Part]] = {
     "i_q": Part("i_q", CURRENT, True),
     "i_d": Part("i_d", CURRENT, True),
     "torque": Part("i_q", DRIVE_TORQUE, True),
+    "angle": Part("theta", ANGLE),
     "echo": Part("echo", PLAIN),
     "state": Part("drive_state", PLAIN),
     "limited": Part("limited", PLAIN),
@@ -67,7 +68,7 @@ SENT: Final[dict[str, Part]] = {
     "load_torque": Part("T_L", TORQUE, True),
     "load_enable": Part("", PLAIN),
 }
-MEASURED: Final = ("speed", "i_q", "i_d", "torque")
+MEASURED: Final = ("speed", "i_q", "i_d", "torque", "angle")
 COMMANDED_Q: Final = ("torque_ref", "i_q_ref", "u_q")
 COMMANDED_D: Final = ("u_d", "i_d_ref")
 """Parts of the command, by what the drive takes; it takes one of the first."""
@@ -104,6 +105,8 @@ class DriveMap:
     """Current i_d."""
     torque: str = ""
     """Torque in place of i_q, of a drive that takes a current or a torque."""
+    angle: str = ""
+    """Mechanical angle of the shaft, from a mark that stays; counted on over turns or not."""
     state: str = ""
     """State of the drive; see states."""
     u_q: str = ""
@@ -207,6 +210,7 @@ def map_of(table: Mapping[str, Any] | None, database: Database, where: str, **fa
 
 def house_map(database: Database) -> DriveMap:
     """The map of the house protocol, classic or FD. Raises DatabaseError when the DBC is another one."""
+    feedback = database.optional("FEEDBACK")
     status = "FEEDBACK" if database.optional("STATUS") is None else "STATUS"
     load = "COMMAND" if database.optional("LOAD_COMMAND") is None else "LOAD_COMMAND"
     counted = dict.fromkeys(("FEEDBACK", "COMMAND", status, load))
@@ -217,6 +221,7 @@ def house_map(database: Database) -> DriveMap:
         speed="FEEDBACK.Speed",
         i_q="FEEDBACK.CurrentQ",
         i_d="FEEDBACK.CurrentD",
+        angle="FEEDBACK.Angle" if feedback and "Angle" in feedback.signals else "",
         state="FEEDBACK.State",
         echo="FEEDBACK.Echo",
         limited="FEEDBACK.Limited",

@@ -44,10 +44,16 @@ CURRENT: Final = _table(
     (RATED, "permille per_mille promille ‰ 1/1000 0.1%"),
 )
 VOLTAGE: Final = _table((1.0, "V Vpk Vp Vpeak V_peak Volt Volts VDC V_dc"), (1e-3, "mV"), (1e3, "kV"))
+ANGLE: Final = _table(
+    (1.0, "rad radian radians"),
+    (_TURN, "rev turn turns revs rotation rotations revolution revolutions r"),
+    (math.pi / 180.0, "deg ° degree degrees"),
+)
 CELSIUS: Final = _table((1.0, "degC C °C ºC ℃ Celsius degreeC degreesC gradC degCelsius deg_C"))
 TORQUE: Final = _table((1.0, "Nm N_m newtonmeter newtonmetre"), (1e-3, "mNm"), (1e3, "kNm"))
 DRIVE_TORQUE: Final = TORQUE | _table((RATED, "permille per_mille promille ‰ 1/1000 0.1%"))
 FIRST: Final = {
+    id(ANGLE): "rad",
     id(SPEED): "rad/s",
     id(CURRENT): "A",
     id(VOLTAGE): "V",
@@ -56,6 +62,7 @@ FIRST: Final = {
     id(DRIVE_TORQUE): "N m",
 }
 _SHOWN: Final = {
+    id(ANGLE): "rad, rev, deg",
     id(SPEED): "rad/s, rpm, 1/min, rev/s, deg/s, erpm",
     id(CURRENT): "A, mA, Arms",
     id(VOLTAGE): "V, mV, kV",

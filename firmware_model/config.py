@@ -323,6 +323,8 @@ class Wire:
     i_q_top: float
     i_d_lsb: float
     i_d_top: float
+    theta_lsb: float = 0.0
+    """Of the shaft's angle; 0: it is not reported."""
 
 
 def build_params(config: PlantConfig, wire: Wire) -> Record:

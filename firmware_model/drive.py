@@ -18,9 +18,9 @@ from firmware_model.jit import jit
 from firmware_model.link import link_voltage
 from firmware_model.load import edge_after, load_torque
 from firmware_model.motor import move
-from firmware_model.plant import PROTOCOL_VERSION, ErrorCode, State
+from firmware_model.plant import ANGLE, PROTOCOL_VERSION, ErrorCode, State
 from firmware_model.rub import friction_torque, rub
-from firmware_model.sensors import measure, whole_degrees
+from firmware_model.sensors import measure, to_turn, whole_degrees
 from firmware_model.speedfilter import track
 
 
@@ -193,6 +193,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     out["w"] = measure(s, s["seen_w"] if p["filter"] > 0 else x[0], p["w_noise"], p["w_lsb"], p["w_top"])
     out["i_q"] = measure(s, x[1], p["i_noise"], p["i_q_lsb"], p["i_q_top"])
     out["i_d"] = measure(s, x[2], p["i_noise"], p["i_d_lsb"], p["i_d_top"])
+    out["theta"] = to_turn(s["series"][ANGLE, 0], p["theta_lsb"])
     out["echo"], out["state"], out["limited"] = s["echo"], s["state"], s["limited"]
     out["protocol_version"] = PROTOCOL_VERSION
     out["v_dc"] = min(np.rint(link_voltage(p, s) / 0.1), 65535.0) * 0.1
@@ -205,6 +206,8 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     s["syncs"] += 1
     t = s["t_ns"] * 1e-9
     out["T_L_true"] = np.float64(
-        np.float32(load_torque(p, t, x[0]) + s["T_commanded"] + friction_torque(p, s, t))
+        np.float32(
+            load_torque(p, t, x[0], s["series"][ANGLE, 0]) + s["T_commanded"] + friction_torque(p, s, t)
+        )
     )
     out["w_true"] = np.float64(np.float32(x[0]))

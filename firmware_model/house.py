@@ -48,7 +48,8 @@ class HouseFrames(Synchronous):
         self.command = database.message("COMMAND", "Counter", "Mode", "Controlword", *self.axes)
         self.load_command = database.optional("LOAD_COMMAND")
         self.status = database.message("STATUS", *SLOW) if database.optional("STATUS") else None
-        measured = MEASURED if self.status else MEASURED | SLOW
+        angle = {"Angle": "theta"} if "Angle" in database.message("FEEDBACK").signals else {}
+        measured = MEASURED | angle | ({} if self.status else SLOW)
         self.answers = [(database.message("TRUTH", *TRUE), TRUE)] if truth else []
         self.answers += [(self.status, SLOW)] if self.status else []
         self.answers += [(database.message("FEEDBACK", *measured), measured)]
@@ -89,7 +90,8 @@ class HouseFrames(Synchronous):
         """Resolution and range of the measured signals."""
         signals = self.answers[-1][0].signals
         speed, i_q, i_d = signals["Speed"], signals["CurrentQ"], signals["CurrentD"]
-        return Wire(speed.scale, speed.top, i_q.scale, i_q.top, i_d.scale, i_d.top)
+        theta_lsb = signals["Angle"].scale if "Angle" in signals else 0.0
+        return Wire(speed.scale, speed.top, i_q.scale, i_q.top, i_d.scale, i_d.top, theta_lsb)
 
     @property
     def counter_modulus(self) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from firmware_model.jit import inlined, jit
-from firmware_model.plant import code_of
+from firmware_model.plant import ANGLE, QUADRATURE, code_of
 from firmware_model.registry import Kernel, Load, loads
 
 
@@ -53,6 +53,10 @@ held_torque_of = _chosen(lambda member: None if member.coefficient else member.t
 """The same of the loads that are constant between their edges."""
 coefficient_of = _chosen(lambda member: member.coefficient, _none)
 """``(load, T, w, t, k)``: Taylor coefficient of a load that varies."""
+turned_of = _chosen(lambda member: member.turned, _none)
+"""``(load, theta)``: torque of a load that goes by the shaft's angle."""
+angular_of = _chosen(lambda member: member.angular, _none)
+"""``(load, T, Q, theta, k)``: its Taylor coefficient."""
 level_of = _chosen(lambda member: member.level, _none)
 """``(load, t)``: dry friction."""
 edge_of = _chosen(lambda member: member.edge, _never)
@@ -60,11 +64,11 @@ edge_of = _chosen(lambda member: member.edge, _never)
 
 
 @jit
-def load_torque(p: Any, t: float, w: float) -> float:
-    """Sum of all loads at plant time t [s], which begins with the first SYNC."""
+def load_torque(p: Any, t: float, w: float, theta: float = 0.0) -> float:
+    """Sum of all loads at plant time t [s], which begins with the first SYNC, and shaft angle theta [rad]."""
     total = 0.0
     for j in range(p["loads"]):
-        total += torque_of(p["load"][j], t, w)
+        total += torque_of(p["load"][j], t, w) + turned_of(p["load"][j], theta)
     return total
 
 
@@ -84,8 +88,11 @@ def varying_load(p: Any, c: Any, t: float, k: int) -> float:
     Rows of ``c``: w, i_q, i_d, loads.
     """
     total = 0.0
+    if p["turns"] and k > 0:
+        c[ANGLE, k] = c[0, k - 1] / k
     for j in range(p["loads"]):
         c[3 + j, k] = coefficient_of(p["load"][j], c[3 + j], c[0], t, k)
+        c[3 + j, k] += angular_of(p["load"][j], c[3 + j], c[QUADRATURE + j], c[ANGLE], k)
         total += c[3 + j, k]
     return total
 

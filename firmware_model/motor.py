@@ -20,8 +20,8 @@ from typing import Any
 from firmware_model.friction import exponential, level, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import held_load, varying_load
-from firmware_model.plant import DRIVE, SLIDE
-from firmware_model.series import ORDER, evaluate, products
+from firmware_model.plant import ANGLE, DRIVE, SLIDE
+from firmware_model.series import ORDER, evaluate, integral, products
 
 
 @jit
@@ -158,6 +158,10 @@ def move(
         series(p, x, c, t, h, u_q, u_d, T_commanded, on)
         for i in range(3):
             x[i] = evaluate(c[i], h)
+        if p["turns"]:
+            c[ANGLE, 0] += integral(c[0], h)
         return
     w, q, d = plain_series(p, x, held_load(p, t + 0.5 * h) + T_commanded, u_q, u_d, on)
     x[0], x[1], x[2] = evaluate(w, h), evaluate(q, h), evaluate(d, h)
+    if p["turns"]:
+        c[ANGLE, 0] += integral(w, h)

@@ -52,7 +52,7 @@ class ODriveFrames(Synchronous):
 
     beat_ns = 100_000_000
     counter_modulus = 256
-    wire = Wire(1e-6, 1e5, 1e-6, 1e4, 1e-6, 1e4)
+    wire = Wire(1e-6, 1e5, 1e-6, 1e4, 1e-6, 1e4, 1e-6)
     """Of float32 on the wire: rounded before to what its bits hold."""
 
     def __init__(self, node_id: int, *, truth: bool) -> None:
@@ -131,7 +131,9 @@ class ODriveFrames(Synchronous):
         if self._truth:
             frames.append((self._id(TRUTH), pack("<ff", out["T_L_true"], out["w_true"]), False))
         frames.append((self._id(GET_IQ), pack("<ff", 0.0, out["i_q"]), False))
-        frames.append((self._id(ESTIMATES), pack("<ff", 0.0, out["w"] / TURN), False))
+        frames.append(
+            (self._id(ESTIMATES), pack("<ff", out.get("theta", 0.0) / TURN, out["w"] / TURN), False)
+        )
         return frames
 
 

@@ -20,9 +20,12 @@ from firmware_model.series import ORDER
 MAX_LOADS: Final = 8
 SLIDE: Final = 3 + MAX_LOADS
 """Row of the series' room that holds which way the shaft slides: -1, 1, or 0 while it sticks."""
-DRIVE, STRIBECK, LINK, INVERSE, POWER = range(SLIDE + 1, SLIDE + 6)
-"""Rows: torque that drives the shaft without friction; e^{-|w| / w_s}; DC link, its inverse, motor power."""
-ROWS: Final = POWER + 1
+DRIVE, STRIBECK, LINK, INVERSE, POWER, ANGLE = range(SLIDE + 1, SLIDE + 7)
+"""Rows: torque that drives the shaft without friction; e^{-|w| / w_s}; DC link, its inverse, motor power; the
+shaft's angle, whose coefficient 0 is the state itself."""
+QUADRATURE: Final = ANGLE + 1
+"""First of the rows, one a load, for the quarter turn ahead of a load that goes by the angle."""
+ROWS: Final = QUADRATURE + MAX_LOADS
 PROTOCOL_VERSION: Final = 1
 
 
@@ -130,6 +133,7 @@ PARAMETERS: Final = {
     "w_lsb": Parameter(lambda c, w: w.w_lsb, "rad/s"),
     "i_q_lsb": Parameter(lambda c, w: w.i_q_lsb, "A"),
     "i_d_lsb": Parameter(lambda c, w: w.i_d_lsb, "A"),
+    "theta_lsb": Parameter(lambda c, w: w.theta_lsb, "rad"),
     "w_top": Parameter(lambda c, w: w.w_top, "rad/s"),
     "i_q_top": Parameter(lambda c, w: w.i_q_top, "A"),
     "i_d_top": Parameter(lambda c, w: w.i_d_top, "A"),
@@ -145,7 +149,8 @@ PARAMETERS: Final = {
     "status_every": Parameter(lambda c, w: c.firmware.status_every, "", "i8"),
     "seed": Parameter(lambda c, w: c.seed, "", "i8"),
     "loads": Parameter(lambda c, w: len(c.all_loads), "", "i8"),
-    "varying": Parameter(lambda c, w: has(c, "coefficient"), "", "i8"),
+    "varying": Parameter(lambda c, w: has(c, "coefficient") or has(c, "angular"), "", "i8"),
+    "turns": Parameter(lambda c, w: has(c, "angular") or w.theta_lsb > 0.0, "", "i8"),
     "rubs": Parameter(lambda c, w: c.friction.most_n_m > 0.0 or has(c, "level"), "", "i8"),
     "coulomb": Parameter(lambda c, w: c.friction.coulomb_n_m, "N m"),
     "static": Parameter(lambda c, w: c.friction.most_n_m, "N m"),
@@ -172,10 +177,11 @@ PARAMETERS: Final = {
 }
 """Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
 
-``*_lsb`` 0: no rounding. ``varying``: a load changes within a substep; ``rubs`` 0: no friction, no brake;
-``capacitance`` 0: the DC link stays at v_dc, which else is the rectifier's no-load voltage. ``takes``: what a
-command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop; ``filter`` is of
-the speed (:class:`Filter`), with its poles, or the samples of a mean and their period.
+``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported. ``turns``: the angle is kept. ``varying``: a
+load changes within a substep; ``rubs`` 0: no friction, no brake; ``capacitance`` 0: the DC link stays at
+v_dc, which else is the rectifier's no-load voltage. ``takes``: what a command is (:class:`Takes`); gains and
+shares of reset are those of the sampled current loop; ``filter`` is of the speed (:class:`Filter`), with its
+poles, or the samples of a mean and their period.
 """
 _NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
 LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)
@@ -258,6 +264,7 @@ SAMPLE: Final = np.dtype(
         ("emcy_due", "i8"),
         ("T_L_true", "f8"),
         ("w_true", "f8"),
+        ("theta", "f8"),
     ],
     align=True,
 )

@@ -38,7 +38,7 @@ class Load:
     """A load torque on the shaft [N m], positive against positive speed; time t is plant time [s].
 
     ``load`` is its record: every number of its table, infinite where one is left out, and ``derived``.
-    Of ``torque`` and ``level`` it has one.
+    Of ``torque``, ``level`` and ``turned`` it has one.
     """
 
     table: type[Table]
@@ -47,6 +47,11 @@ class Load:
     coefficient: Kernel | None = None
     """``coefficient(load, T, w, t, k)``: Taylor coefficient k of a torque that varies, about t; ``w`` has the
     coefficients of the speed up to k, ``T`` its own up to k - 1."""
+    turned: Kernel | None = None
+    """``turned(load, theta)``: torque by the shaft's angle theta [rad]; it goes with ``angular``."""
+    angular: Kernel | None = None
+    """``angular(load, T, Q, theta, k)``: its Taylor coefficient k; ``theta`` has the angle's coefficients up
+    to k, ``T`` its own up to k - 1, ``Q`` is a row of its own beside ``T``."""
     level: Kernel | None = None
     """``level(load, t)``: dry friction, which holds the shaft and never drives it."""
     edge: Kernel | None = None
@@ -107,8 +112,11 @@ def _mistake(member: Any, known: Mapping[str, Load]) -> str:
     strange = [name for name, one in fields.items() if name != "kind" and not _is_number(one.annotation)]
     if strange:
         return f"{', '.join(strange)}: keys of a load are numbers"
-    if (member.torque is None) == (member.level is None) or (member.coefficient and not member.torque):
-        return "it has a torque, with a coefficient if it varies, or a level of dry friction"
+    one = sum(kernel is not None for kernel in (member.torque, member.level, member.turned)) == 1
+    if not one or (member.coefficient and not member.torque) or bool(member.angular) != bool(member.turned):
+        return (
+            "it has a torque, with a coefficient if it varies, or turned and angular, or a level of friction"
+        )
     return ""
 
 

@@ -15,8 +15,8 @@ from firmware_model.jit import jit
 from firmware_model.link import advance_held_link, advance_link
 from firmware_model.load import held_load, load_torque
 from firmware_model.motor import rubbed_series, series
-from firmware_model.plant import DRIVE, POWER, SLIDE, STRIBECK
-from firmware_model.series import ORDER, evaluate, first_crossing, within
+from firmware_model.plant import ANGLE, DRIVE, POWER, SLIDE, STRIBECK
+from firmware_model.series import ORDER, evaluate, first_crossing, integral, within
 
 W_ERROR = 1e-10
 """Last term of the series of w [rad/s], and of the Stribeck exponential, that a step may have."""
@@ -31,7 +31,7 @@ def drive_torque(p: Any, s: Any, t: float) -> float:
     """Torque on the shaft without friction [N m], at t [s]."""
     x = s["x"]
     electric = 1.5 * p["n_p"] * (p["psi_f"] + (p["L_d"] - p["L_q"]) * x[2]) * x[1]
-    load = load_torque(p, t, x[0]) + s["T_commanded"]
+    load = load_torque(p, t, x[0], s["series"][ANGLE, 0]) + s["T_commanded"]
     return float(electric - p["B_f"] * x[0] - load + p["J"] * p["phi_w"])
 
 
@@ -122,6 +122,8 @@ def rub_held(p: Any, s: Any, t: float, h: float, on: bool) -> None:
         x[0], x[1], x[2] = evaluate(w, step), evaluate(q, step), evaluate(d, step)
         if way * x[0] <= 0.0:
             x[0] = 0.0
+        if p["turns"]:
+            s["series"][ANGLE, 0] += integral(w, step)
         if p["capacitance"] > 0.0:
             advance_held_link(p, s, s["series"], power_of(s["u_q"], s["u_d"], q, d, on), step)
         t, left = t + step, left - step
@@ -146,6 +148,8 @@ def rub(p: Any, s: Any, t: float, h: float, on: bool) -> None:
             x[i] = evaluate(c[i], step)
         if p["rubs"] and c[SLIDE, 0] * x[0] <= 0.0:
             x[0] = 0.0
+        if p["turns"]:
+            c[ANGLE, 0] += integral(c[0], step)
         if p["capacitance"] > 0.0:
             advance_link(p, s, c, step)
         t, left = t + step, left - step

@@ -6,6 +6,7 @@ overflow; a normal number is the sum of 12 uniform ones (no libm), the same to t
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -69,6 +70,15 @@ def to_wire(value: float, lsb: float, top: float) -> float:
     """
     raw_top = np.rint(top / lsb)
     return float(min(max(np.rint(value / lsb), -raw_top), raw_top) * lsb + 0.0)
+
+
+@jit
+def to_turn(theta: float, lsb: float) -> float:
+    """An angle within a turn, rounded to the wire's resolution; NaN where it is not reported."""
+    if lsb <= 0.0:
+        return math.nan
+    turn = 2.0 * math.pi
+    return float(np.rint((theta - math.floor(theta / turn) * turn) / lsb) * lsb)
 
 
 @jit

@@ -43,6 +43,15 @@ def evaluate(a: Any, h: float) -> float:
     return float(value)
 
 
+@jit
+def integral(a: Any, h: float) -> float:
+    """sum_k a_k h^{k+1} / (k + 1), the integral of the series from 0 to h."""
+    value = a[ORDER] / (ORDER + 1)
+    for k in range(ORDER - 1, -1, -1):
+        value = value * h + a[k] / (k + 1)
+    return float(value * h)
+
+
 LOOKS = 8
 """Places at which a series is looked at for a change of sign."""
 

@@ -8,6 +8,7 @@ amplitude-invariant; ``w`` is the mechanical speed.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, Literal
@@ -232,6 +233,8 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(36, "missing", "u4", "", "input",
           "bit i: the i-th slow message of the drive's map has not come since the previous tick",
           absent=0),
+    Field(69, "theta", "f8", "rad", "input", "measured mechanical angle, NaN where the drive reports none",
+          absent=math.nan, shown=Shown("theta", "theta", compared=False)),
     Field(48, "state", "u4", "", "output", "DriveState of the supervisor",
           shown=Shown("state", "supervisor")),
     Field(49, "reason", "u4", "", "output", "Reason that latched, 0 while none"),
@@ -303,7 +306,7 @@ def _new_tick() -> TickArray:
     tick = np.zeros(1, TICK)
     for field in FIELDS:
         tick[f"_{field.number}"] = tag(field.number, field.kind)
-    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true"):
+    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true", "theta"):
         tick[name] = np.nan
     return tick
 

@@ -22,7 +22,7 @@ from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speedfilter import MOST_AVERAGE
 from hil.log.named import to_named
 from hil.signals import TickArray, new_ticks
-from hil.tick.guard import MEASURED, MOST_MESSAGES, NO_I_D, NO_I_Q, SAFETY_PARAMS
+from hil.tick.guard import MEASURED, MOST_MESSAGES, NO_ANGLE, NO_I_D, NO_I_Q, SAFETY_PARAMS
 from hil.tick.kernel import PLACED, new_safety_state, step, whole, whole_at
 from hil.tick.setpoint import new_setpoint_state, no_setpoint, prepare
 
@@ -252,6 +252,7 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     _slow_messages(p, config, wire)
     if inner := inner_loop(config):
         p["k_u"], p["u_i"], p["absent"] = inner.k_u, inner.u_i, wire.absent
+    p["absent"] |= 0 if "angle" in wire.measured else NO_ANGLE
     if config.loop.shadow:  # command and reference are somebody else's, not ours
         for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):
             p[name] = math.inf

@@ -59,6 +59,8 @@ NUMBERS: Final = (
     "on_value",
     "off_value",
     "n_p",
+    "order",
+    "orders",
     "fifo_priority",
     "cpu",
     "node_id",

@@ -41,7 +41,7 @@ from hil.runtime.setup import Setup
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 from hil.sim.columns import Columns, gather
 from hil.sim.emulate import load_plant
-from hil.tick.guard import NO_I_D, NO_I_Q, SAFETY_PARAMS, SAFETY_STATE
+from hil.tick.guard import NO_ANGLE, NO_I_D, NO_I_Q, SAFETY_PARAMS, SAFETY_STATE
 from hil.tick.kernel import step
 from hil.tick.reasons import explain
 from hil.tick.setpoint import SETPOINT_PARAMS, SETPOINT_STATE, prepare
@@ -62,6 +62,7 @@ def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int, messages: int) -> N
     t["w"] = o["w"]
     t["i_q"] = math.nan if absent & NO_I_Q else o["i_q"]
     t["i_d"] = math.nan if absent & NO_I_D else o["i_d"]
+    t["theta"] = math.nan if absent & NO_ANGLE else o["theta"]
     t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
     t["rx_flags"], t["missing"] = RxFlag.FRESH.value, ALL_MISSING
     t["T_L_true"] = o["T_L_true"]

@@ -68,10 +68,11 @@ SAFETY_PARAMS: Final = np.dtype(
 of the drive's map, whose age may be ``age_max`` periods; ``carried_by``: what v_dc, motor and inverter
 temperature come with, as bits of ``came``, 0 for what the drive does not send. ``k_u``: torque per unit of
 the command of a drive that takes a current or a torque, ``u_i`` that unit per ampere; 0 for voltages.
-``absent``: currents that the drive does not report, NO_I_Q and NO_I_D.
+``absent``: what the drive does not report, NO_I_Q, NO_I_D and NO_ANGLE.
 """
 NO_I_Q: Final = 1
 NO_I_D: Final = 2
+NO_ANGLE: Final = 4
 MEASURED: Final = 1 << 16
 """Bit of ``came`` for the messages that measure."""
 MOST_MESSAGES: Final = 8

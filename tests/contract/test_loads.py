@@ -22,9 +22,9 @@ from firmware_model import drive
 from firmware_model.config import PlantConfig, Wire, build_params, new_state
 from firmware_model.load import edge_after, load_torque
 from firmware_model.loads import brake, constant, sine
-from firmware_model.plant import LOAD, PARAMETERS, PARAMS, State
+from firmware_model.plant import ANGLE, LOAD, PARAMETERS, PARAMS, State
 from firmware_model.registry import Load, PlantError, _checked, loads
-from firmware_model.series import ORDER, evaluate
+from firmware_model.series import ORDER, evaluate, integral
 from firmware_model.tables import Finite, Table
 from hil.manual.keys import found, tables
 from tests.conftest import CONFIGS, ROOT
@@ -36,14 +36,16 @@ MOTOR = {
 FREE = {"i_trip_a": 1e3, "w_trip_rad_s": 1e4, "temperature_trip_c": 1e3}
 KINDS = sorted(loads())
 VARYING = [kind for kind in KINDS if loads()[kind].coefficient]
-HELD = [kind for kind in KINDS if kind not in VARYING]
+TURNED = [kind for kind in KINDS if loads()[kind].turned]
+HELD = [kind for kind in KINDS if kind not in VARYING + TURNED]
 ENDS = {"at_s": 0.0101237, "until_s": 0.0303333}
 
 
 def table_of(kind: str) -> dict[str, Any]:
     """A table of any load: what must be given, and times within what is looked at."""
     fields = loads()[kind].table.model_fields
-    needed = {name: 1.25 for name, field in fields.items() if field.is_required() and name != "kind"}
+    required = {name: field for name, field in fields.items() if field.is_required() and name != "kind"}
+    needed = {name: 5 if field.annotation is int else 1.25 for name, field in required.items()}
     return {"kind": kind} | needed | {name: s for name, s in ENDS.items() if name in fields}
 
 
@@ -80,6 +82,23 @@ def test_the_coefficients_of_a_load_are_the_series_of_its_torque(kind: str, w_0:
     assert np.abs(T[1:]).max() > 0
 
 
+@pytest.mark.parametrize("kind", TURNED)
+@pytest.mark.parametrize("w_0", [7.0, 0.0, -3.0])
+def test_the_coefficients_of_a_load_by_the_angle_are_the_series_of_its_torque(kind: str, w_0: float) -> None:
+    load, member = params_of(kind)["load"][0], loads()[kind]
+    assert member.turned and member.angular
+    w = np.array([w_0, *np.random.default_rng(4).normal(size=ORDER - 1) * 10.0 ** np.arange(1, ORDER)])
+    theta = np.array([0.4, *(w / np.arange(1, ORDER + 1))])
+    T, Q = np.zeros(ORDER + 1), np.zeros(ORDER + 1)
+    for k in range(ORDER + 1):
+        T[k] = member.angular(load, T, Q, theta, k)
+    for h in (0.0, 1e-4, 1e-3):
+        exact = member.turned(load, evaluate(theta, h))
+        assert evaluate(T, h) == pytest.approx(exact, rel=1e-9, abs=1e-12), h
+        assert theta[0] + integral(np.append(w, 0.0), h) == pytest.approx(evaluate(theta, h), rel=1e-15)
+    assert np.abs(T[1:]).max() > 0
+
+
 @pytest.mark.parametrize("kind", HELD)
 def test_a_load_that_does_not_vary_is_constant_between_its_edges(kind: str) -> None:
     p, member = params_of(kind), loads()[kind]
@@ -103,29 +122,32 @@ def test_a_motor_under_a_load_follows_dop853(kind: str) -> None:
     drive.advance(p, s, 40_000_000)
 
     def rates(t: float, x: Any) -> list[float]:
-        w, q, d = x
+        w, q, d, theta = x
         T = 4.5 * (0.7 * q + (0.02 - 0.033) * d * q)
         return [
-            (T - load_torque(p, t, w)) / 0.011,
+            (T - load_torque(p, t, w, theta)) / 0.011,
             (60.0 - 2.0 * q - 3 * w * (0.02 * d + 0.7)) / 0.033,
             (-20.0 - 2.0 * d + 3 * w * 0.033 * q) / 0.02,
+            w,
         ]
 
-    x, t = np.zeros(3), 0.0
+    x, t = np.zeros(4), 0.0
     while t < 0.04:
         end = min(edge_after(p, round(t * 1e9)) * 1e-9, 0.04)
         x = solve_ivp(rates, (t, end - 1e-15), x, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
         t = end
-    np.testing.assert_allclose(s["x"], x, rtol=0, atol=1e-7)  # an edge is met to the nanosecond
+    np.testing.assert_allclose(s["x"], x[:3], rtol=0, atol=1e-7)  # an edge is met to the nanosecond
+    if p["turns"]:
+        assert s["series"][ANGLE, 0] == pytest.approx(x[3], abs=1e-9)
     assert abs(x[0]) > 1.0
 
 
 def test_the_order_of_loads_means_nothing_but_the_order_of_a_sum() -> None:
     ways = [params_of(*KINDS), params_of(*reversed(KINDS))]
     for t, w in [(0.0, 0.0), (0.02, 5.0), (0.02, -5.0), (0.5, 30.0)]:
-        one, other = (load_torque(p, t, w) for p in ways)
+        one, other = (load_torque(p, t, w, 0.3) for p in ways)
         assert one == pytest.approx(other, rel=1e-12) and edge_after(ways[0], 0) == edge_after(ways[1], 0)
-        own = sum(load_torque(params_of(kind), t, w) for kind in KINDS)
+        own = sum(load_torque(params_of(kind), t, w, 0.3) for kind in KINDS)
         assert one == pytest.approx(own, rel=1e-12)
 
 
