@@ -59,7 +59,7 @@ class ODriveFrames(Synchronous):
         self._node, self._truth = node_id, truth
         self._mode = (0, 0)
         self._on = self._clear = False
-        self._cycles = self._counter = 0
+        self._cycles = self._counter = self._beaten = self._error = 0
         self.sync_id: int | None = self._id(STEP)
         self.ignored: Counter[str] = Counter()
 
@@ -77,8 +77,13 @@ class ODriveFrames(Synchronous):
         return []
 
     def beat(self) -> list[Sent]:
-        """Before its time has begun a heartbeat by the clock; then it comes with the cycles."""
-        return [] if self._cycles else [(self._id(HEARTBEAT), struct.pack("<IBBBx", 0, IDLE, 0, 0), False)]
+        """While its time stands still, in lockstep with nobody, an idle axis is heard by the clock alone."""
+        stands, self._beaten = self._cycles == self._beaten, self._cycles
+        return [self._heartbeat(IDLE)] if stands and not self._on else []
+
+    def _heartbeat(self, state: int) -> Sent:
+        beat = struct.pack("<IBBBx", ERRORS.get(self._error, 0x2), state, 0, 0)
+        return self._id(HEARTBEAT), beat, False
 
     def take(self, frame: Frame, drive: Kernels, catch_up: Callable[[], None]) -> None:
         """Take a command, whole or not at all."""
@@ -121,10 +126,10 @@ class ODriveFrames(Synchronous):
     def answer(self, out: dict[str, Any]) -> list[Sent]:
         """Heartbeat, temperatures and supply when due, truth, current, speed last."""
         pack, frames, self._cycles = struct.pack, [], self._cycles + 1
+        self._error = int(out["error"])
         if self._cycles % BEAT_EVERY == 1:
             state = CLOSED_LOOP if out["state"] == State.OPERATION_ENABLED else IDLE
-            beat = pack("<IBBBx", ERRORS.get(int(out["error"]), 0x2), state, 0, 0)
-            frames.append((self._id(HEARTBEAT), beat, False))
+            frames.append(self._heartbeat(state))
             degrees = pack("<ff", out["temperature_inverter"], out["temperature_motor"])
             frames.append((self._id(TEMPERATURE), degrees, False))
             frames.append((self._id(BUS), pack("<ff", out["v_dc"], 0.0), False))

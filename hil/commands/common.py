@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -34,6 +35,12 @@ def lean_imports() -> Iterator[None]:
     finally:
         for name in hidden:
             del sys.modules[name]
+
+
+def one_thread() -> None:
+    """One thread for matrices of three rows, which more make slower: set before numpy is imported."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
 
 
 class Commands:

@@ -5,14 +5,25 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
+from hil.commands.common import (
+    EXIT_FAILED,
+    Commands,
+    bus_flags,
+    lean_imports,
+    one_thread,
+    overrides,
+    print_json,
+    say,
+)
 from hil.log.outputs import output_file, output_folder
 
 if TYPE_CHECKING:
+    from hil.config.tables import RunConfig
     from hil.runtime.setup import Overrides
 
 
@@ -41,6 +52,7 @@ def register(commands: Commands) -> None:
 
 def cmd_identify(args: argparse.Namespace) -> int:
     """Identify."""
+    one_thread()
     from hil.errors import HilError
 
     if args.logs and (args.config or args.emulated or args.arm or args.steps):
@@ -112,16 +124,21 @@ def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
     check_arming(setup, args.arm)
     if not (args.yes or emulated):
         confirm(setup.config, sys.stdin, sys.stderr)
-    with _emulator(args, given):
+    with _emulator(args, given, setup.config):
         session = identify(args.config, setup.config, names, say, arm=args.arm)
     text = motor_toml(session) if not session.faults else ""
     return session.as_dict() | {"file": _write(file, text)}
 
 
-def _emulator(args: argparse.Namespace, given: Overrides) -> contextlib.AbstractContextManager[Any]:
-    """The emulator as a process, or nothing."""
+@contextlib.contextmanager
+def _emulator(args: argparse.Namespace, given: Overrides, config: RunConfig) -> Iterator[None]:
+    """The emulator as a process, set up where its kind has to be, or nothing."""
     if not args.emulated:
-        return contextlib.nullcontext()
-    from hil.sim.demo import emulator_process
+        yield
+        return
+    from hil.sim.demo import emulator_process, set_up
 
-    return emulator_process(args.config, given)
+    with emulator_process(args.config, given):
+        if config.canopen is not None:
+            set_up(args.config, config)
+        yield

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
-from hil.commands.tuning import _above_one, _lean, _not_negative, _positive
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, one_thread, overrides, print_json, say
+from hil.commands.tuning import _above_one, _not_negative, _positive
 from hil.log.outputs import output_file
 
 
@@ -50,7 +50,7 @@ def _cases(text: str) -> int:
 
 def cmd_tune(args: argparse.Namespace) -> int:
     """Tune."""
-    _lean()
+    one_thread()
     from hil.identify.tune import at_motor, tune, written
     from hil.report.view import key_values, progress, show
     from hil.tuning.design import Wish

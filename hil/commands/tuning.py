@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from pathlib import Path
 from typing import Any
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, one_thread, overrides, print_json, say
 from hil.log.outputs import output_file, output_folder
 
 SPREAD = 0.3
@@ -138,15 +137,9 @@ def _spread(given: list[str]) -> dict[str, float]:
     return shares
 
 
-def _lean() -> None:
-    """One thread for matrices of three rows: set before numpy is imported."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-
-
 def cmd_compare(args: argparse.Namespace) -> int:
     """Compare laws."""
-    _lean()
+    one_thread()
     from hil.report.view import progress, show
     from hil.tuning.compare import Wish, compare, parse_laws
     from hil.tuning.families import DEFAULT_LAWS
@@ -175,7 +168,7 @@ def cmd_compare(args: argparse.Namespace) -> int:
 
 def cmd_design(args: argparse.Namespace) -> int:
     """Design windows and poles."""
-    _lean()
+    one_thread()
     from hil.report.view import show
     from hil.tuning.design import WINDOWS, Wish, design
     from hil.tuning.page import front_picture
