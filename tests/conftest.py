@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import uuid
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # small matrices; before numpy
+    os.environ.setdefault(name, "1")
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs"
 

@@ -130,6 +130,20 @@ def test_the_emulated_drive_takes_a_torque_in_mode_1_1_and_state_8_alone() -> No
     assert drive.commands[-1] == (0, 0.0)
 
 
+def test_an_idle_drive_whose_time_stands_still_goes_on_beating() -> None:
+    """In lockstep nobody moves it on after a run; the next one must hear it. While it runs no beat is added."""
+    frames, drive = ODriveFrames(NODE, truth=False), Drive()
+    out = {name: 0.0 for name in ("v_dc", "temperature_motor", "temperature_inverter", "i_q", "w")}
+    out |= {"error": 0x8130, "state": int(DriveState.FAULT)}
+    assert frames.beat() == [(HEARTBEAT, struct.pack("<IBBBx", 0, 1, 0, 0), False)]
+    frames.answer(out)
+    assert frames.beat() == []
+    error = struct.pack("<IBBBx", 0x1000000, 1, 0, 0)
+    assert frames.beat() == [(HEARTBEAT, error, False)]
+    frames.take(Frame(STATE, struct.pack("<Q", 8), 0, False), drive, lambda: None)  # type: ignore[arg-type]
+    assert frames.beat() == []
+
+
 def test_what_the_emulated_drive_sends_is_read_by_cantools() -> None:
     database = cantools.database.load_file(CONFIGS / "drives/odrive.dbc", strict=False)
     out = {
