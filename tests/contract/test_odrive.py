@@ -131,9 +131,9 @@ def test_the_emulated_drive_takes_a_torque_in_mode_1_1_and_state_8_alone() -> No
 
 
 def test_an_idle_drive_whose_time_stands_still_goes_on_beating() -> None:
-    """In lockstep nobody moves it on after a run; the next one must hear it. While it runs no beat is added."""
+    """In lockstep nobody moves it on after a run, and the next must hear it; a run hears no beat more."""
     frames, drive = ODriveFrames(NODE, truth=False), Drive()
-    out = {name: 0.0 for name in ("v_dc", "temperature_motor", "temperature_inverter", "i_q", "w")}
+    out = dict.fromkeys(("v_dc", "temperature_motor", "temperature_inverter", "i_q", "w"), 0.0)
     out |= {"error": 0x8130, "state": int(DriveState.FAULT)}
     assert frames.beat() == [(HEARTBEAT, struct.pack("<IBBBx", 0, 1, 0, 0), False)]
     frames.answer(out)
