@@ -46,7 +46,9 @@ def report(*logs: File, path: File) -> Report:
 
     The result says ``passed`` and, as ``as_dict()``, all that the page shows. Raises ``hil.HilError``.
     """
-    return build_report([Path(log) for log in logs], Path(path))
+    from hil.identify.section import identification
+
+    return build_report([Path(log) for log in logs], Path(path), sections=identification)
 
 
 def _seen(log: Log | File) -> Run:

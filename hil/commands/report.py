@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, print_json
+from hil.commands.common import EXIT_FAILED, Commands, one_thread, print_json
 from hil.log.outputs import output_file
 
 
@@ -22,13 +22,15 @@ def register(commands: Commands) -> None:
 
 def cmd_report(args: argparse.Namespace) -> int:
     """Write a report."""
+    one_thread()
+    from hil.identify.section import identification
     from hil.log.parts import grouped
     from hil.report.build import build
     from hil.report.criteria import SIGNS, judge
     from hil.report.view import key_values, show
 
     out = output_file(args.output or args.log[0].with_suffix(".html"), ".html", ".png")
-    report = build(grouped(args.log), out, verify=not args.no_replay)
+    report = build(grouped(args.log), out, verify=not args.no_replay, sections=identification)
     if args.json:
         print_json(report.as_dict())
     else:

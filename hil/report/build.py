@@ -12,6 +12,7 @@ from hil.log.reader import Source
 from hil.report.collect import Run, collect
 from hil.report.criteria import figures, judge, notes, open_loop
 from hil.report.page import page
+from hil.report.section import Section, Sections, no_more
 
 MOST_LOGS: Final = 8
 KINDS: Final = (".html", ".htm", ".png")
@@ -23,6 +24,7 @@ class Report:
 
     path: Path
     runs: tuple[Run, ...]
+    sections: tuple[Section, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -47,11 +49,17 @@ class Report:
                 }
                 for run in self.runs
             ],
+            **{section.key: section.data for section in self.sections},
         }
 
 
-def build(logs: Sequence[Source], out: Path, *, verify: bool = True) -> Report:
-    """Read the logs and write the report. Raises HilError before reading what could not be written."""
+def build(
+    logs: Sequence[Source], out: Path, *, verify: bool = True, sections: Sections = no_more
+) -> Report:  # fmt: skip
+    """Read the logs and write the report, with the page's ``sections`` of later rooms.
+
+    Raises HilError before reading what could not be written.
+    """
     if out.suffix.lower() not in KINDS:
         raise HilError(f"{out}: a report is an HTML page or a PNG picture; name it .html or .png")
     if len(logs) > MOST_LOGS:
@@ -63,13 +71,14 @@ def build(logs: Sequence[Source], out: Path, *, verify: bool = True) -> Report:
     for index, run in enumerate(runs):
         run.name = f"{run.name} ({index + 1})" if names.count(names[index]) > 1 else run.name
         run.name += " (open loop)" if open_loop(run) else ""
+    more = tuple(sections(runs))
     try:
         if out.suffix.lower() == ".png":
             from hil.report.picture import picture
 
             out.write_bytes(picture(runs))
         else:
-            out.write_text(page(runs), encoding="utf-8", errors="replace")
+            out.write_text(page(runs, more), encoding="utf-8", errors="replace")
     except OSError as error:
         raise HilError(f"{out}: can't be written: {error.strerror or error}") from error
-    return Report(out, tuple(runs))
+    return Report(out, tuple(runs), more)

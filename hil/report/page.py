@@ -30,6 +30,7 @@ from hil.report.criteria import (
 from hil.report.curves import limits_text, plots_of
 from hil.report.embed import MOST_EVENTS, charts, is_empty, report_data, script_json
 from hil.report.frames import REMOTE, id_text
+from hil.report.section import Section
 from hil.report.segments import Response
 from hil.report.statistics import SPECTRUM_FIELDS
 
@@ -269,14 +270,15 @@ def _each(runs: Sequence[Run], what: Any) -> str:
     )
 
 
-def page(runs: Sequence[Run]) -> str:
-    """The whole page."""
+def page(runs: Sequence[Run], more: Sequence[Section] = ()) -> str:
+    """The whole page; ``more``: sections after the curves."""
     scripts = (asset("uPlot.iife.min.js"), asset("page.js"))
     styles = (asset("uPlot.min.css"), asset("page.css"))
     policy = (
         f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; "
         f"style-src {' '.join(map(_hash, styles))}; base-uri 'none'; form-action 'none'"
     )
+    sections = "".join(f"<section><h2>{escape(s.title)}</h2>{s.html}</section>\n" for s in more)
     title = escape(" · ".join(run.name for run in runs))
     kind = "Comparison of runs" if len(runs) > 1 else "Run"
     head = f"""<!doctype html>
@@ -291,7 +293,7 @@ def page(runs: Sequence[Run]) -> str:
 double-click for the whole run; click a name under a plot to hide its curve</span>
 <span id="near" class="small"></span></div>
 <section><h2>Curves</h2><div id="plots">{_plots(runs)}</div></section>
-<section><h2>Figures</h2>{metrics(runs)}</section>
+{sections}<section><h2>Figures</h2>{metrics(runs)}</section>
 <section><h2>Step responses</h2>{_each(runs, responses)}</section>
 <section><h2>Time of a tick, spectra</h2>{_each(runs, phases)}
 <div class="columns">{_charts(runs)}</div></section>
