@@ -353,14 +353,14 @@ class _Binder:
         return name
 
     def _check_periods(self, incoming: list[Bound]) -> None:
-        """Measurements must come at least once a period, by the DBC's cycle time where it has one."""
+        """Measurements must come as often as is said, by the DBC's cycle time where it has one."""
         for bound in incoming:
             measures = any(part in MEASURED for part, _ in bound.parts)
             cycle = bound.message.cycle_ms
             if measures and self._period_ms is not None and cycle > self._period_ms:
                 self._add(
-                    f"{bound.message.name} comes every {cycle:g} ms by the DBC, the loop runs every "
-                    f"{self._period_ms:g} ms; lower loop.rate_hz"
+                    f"{bound.message.name} comes every {cycle:g} ms by the DBC, the loop counts on one every "
+                    f"{self._period_ms:g} ms; write feedback.period_ms = {cycle:g}, or lower loop.rate_hz"
                 )
 
     def _check_shared(self, message: Message, names: Iterable[str]) -> None:

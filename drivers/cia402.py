@@ -23,6 +23,8 @@ NO_RTR: Final = 1 << 30
 COB_IDS: Final = {RPDO: (0x200, 0x300, 0x400, 0x500), TPDO: (0x180, 0x280, 0x380, 0x480)}
 """The predefined connection set: identifiers of PDO 1 to 4, to which the node's number is added."""
 EVERY_SYNC: Final = 1
+MOST_SYNCS: Final = 240
+"""Transmission types 1 to 240: with every SYNC, or every so many."""
 MODE, MODE_SHOWN, STATUSWORD, CONTROLWORD = 0x6060, 0x6061, 0x6041, 0x6040
 INTERPOLATION, HEARTBEAT, SYNC_PERIOD, SYNC_COUNT, STORE = 0x60C2, 0x1017, 0x1006, 0x1019, 0x1010
 SAVE: Final = int.from_bytes(b"save", "little")
@@ -69,6 +71,8 @@ class Wish:
     tpdo: tuple[tuple[Place, ...], ...] = ()
     sync_period: bool = False
     rpdo_timeout_ms: int | None = None
+    every: int = 1
+    """SYNCs from one answer of the node to the next."""
 
 
 class Entry(NamedTuple):
@@ -106,6 +110,7 @@ class Pdo:
     objects: tuple[Mapped, ...]
     entries: tuple[Entry, ...]
     timer: Entry | None = None
+    every: int = EVERY_SYNC
 
     @property
     def sent(self) -> bool:
@@ -118,11 +123,12 @@ class Pdo:
         return sum(one.length for one in self.objects) // 8
 
     def on(self) -> tuple[Entry, Entry]:
-        """Its identifier and that it goes with every SYNC."""
+        """Its identifier and that it goes with every SYNC, or every so many."""
         where = f"{self.name} on 0x{self.cob_id:X}"
+        each = "every SYNC" if self.every == EVERY_SYNC else f"every {self.every}th SYNC"
         return (
             Entry(Place(self.index, 1), self.cob_id, 4, where, NO_RTR),
-            Entry(Place(self.index, 2), EVERY_SYNC, 1, f"{self.name} with every SYNC"),
+            Entry(Place(self.index, 2), self.every, 1, f"{self.name} with {each}"),
         )
 
     def wanted(self) -> Iterator[Entry]:
@@ -226,10 +232,12 @@ class _Maker:
                   f"{name} carries {one.place} {one.name}")
             for k, one in enumerate(objects, 1)
         )  # fmt: skip
-        cob_id = COB_IDS[base][number] + self._node_id
-        return Pdo(
-            base + number, maps + number, name, cob_id, tuple(objects), entries, self._timer(base, number)
+        cob_id, every = (
+            COB_IDS[base][number] + self._node_id,
+            EVERY_SYNC if base == RPDO else self._wish.every,
         )
+        timer = self._timer(base, number)
+        return Pdo(base + number, maps + number, name, cob_id, tuple(objects), entries, timer, every)
 
     def _timer(self, base: int, number: int) -> Entry | None:
         """The deadline of the first RPDO: the drive's own watchdog of commands."""

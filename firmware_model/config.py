@@ -254,6 +254,10 @@ def _as_step(fault: ExtraLoad) -> StepLoad:
     return StepLoad(kind="step", torque_n_m=fault.torque_n_m, at_s=fault.at_s, until_s=until_s)
 
 
+SELDOM = ("house", "odrive")
+"""Protocols whose measurements may go out in each so manieth cycle alone."""
+
+
 class PlantConfig(Table):
     """The whole emulated drive."""
 
@@ -269,6 +273,9 @@ class PlantConfig(Table):
     """Path of a CiA 402 drive's EDS, relative to this file."""
     pacing: Literal["sync", "cyclic"] = "sync"
     """The drive answers SYNC, or sends by its own clock (cyclic)."""
+    feedback_every: Annotated[int, Field(ge=1, le=64)] = 1
+    """It measures and tells in each so manieth cycle (SYNC, or its own clock's); protocols house and odrive.
+    A CiA 402 drive goes by its TPDOs' transmission types."""
     substep_us: Annotated[int, Field(ge=1, le=100_000)] = 500
     """Longest step of the motor's Taylor series."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 1
@@ -304,6 +311,14 @@ class PlantConfig(Table):
     def _has_its_eds(self) -> PlantConfig:
         if bool(self.eds) != dialect(self.protocol).eds:
             raise ValueError('eds and a protocol that needs one, as "cia402", belong together')
+        return self
+
+    @model_validator(mode="after")
+    def _may_be_seldom(self) -> PlantConfig:
+        if self.feedback_every > 1 and self.protocol not in SELDOM:
+            raise ValueError(
+                f"feedback_every = {self.feedback_every}: of protocols {', '.join(SELDOM)} alone"
+            )
         return self
 
     @model_validator(mode="after")

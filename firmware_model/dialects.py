@@ -48,6 +48,8 @@ class Frames(Protocol):
     answers_commands: bool
     """The message of ``sync_id`` is the command, which is taken before it is answered."""
     ignored: Counter[str]
+    feedback: bool
+    """Whether the measurements are among the next answer, which a drive that measures seldom leaves out."""
 
     @property
     def beat_ns(self) -> int:
@@ -86,6 +88,7 @@ class Synchronous:
 
     due: Sequence[Sent] = ()
     answers_commands = False
+    feedback = True
 
     def asks(self, data: bytes) -> bool:
         """CANopen's SYNC has no data or its counter."""

@@ -153,12 +153,14 @@ class HouseFrames(Synchronous):
         drive.load(T_L if enable else 0.0)
 
     def answer(self, out: dict[str, Any]) -> list[Sent]:
-        """EMCY if a fault arose, TRUTH, STATUS when due, FEEDBACK last."""
+        """EMCY if a fault arose, TRUTH, STATUS when due, FEEDBACK last, where it is."""
         frames: list[Sent] = []
         if out["emcy_due"]:
             frames.append((self._emergency_id, struct.pack("<HB5x", int(out["error"]), 1), False))
         for place, (message, fields) in enumerate(self.answers, FIRST_ANSWER):
             if message is self.status and not out["status_due"]:
+                continue
+            if message is self.answers[-1][0] and not self.feedback:
                 continue
             values = {name: out[field] for name, field in fields.items()}
             if "Counter" in message.signals:

@@ -21,6 +21,7 @@ import numpy as np
 from drivers.bus import Frame, Link, unpack_frame
 from drivers.codec import Database
 from drivers.errors import LinkError
+from drivers.lockstep import tick_over
 from firmware_model.config import Record, Wire, new_sample, new_state
 from firmware_model.dialects import Eds, Frames, Sent, dialect
 from firmware_model.drive import advance
@@ -80,19 +81,26 @@ class Node:
         protocol: str = "house",
         eds: Path | None = None,
         faults: PlantFaults | None = None,
+        every: int = 1,
+        ends_ticks: bool = False,
     ) -> None:
+        """``every``: cycles from one measurement to the next; ``ends_ticks``: tell that a SYNC is answered.
+
+        Who waits in lockstep knows then that no more comes.
+        """
         self._link, self._clock, self._period_ns = link, clock, period_ns
         self._pacing = "sync" if dialect(protocol).steps and clock == "lockstep" else pacing
         self._make_frames = functools.partial(
             frames_of, database, protocol, truth, (eds, {}) if eds else None
         )
         self._frames, self._faults = self._make_frames(), faults
+        self._every, self._cycles, self._ends_ticks = every, 0, ends_ticks
         self._params = params
         self._state = new_state(params, self._frames.counter_modulus - 1)
         records = params, self._state, new_sample()
         self._kernels = Kernels(*records)
         self._station: Station | None = None
-        if pacing == "sync" and faults is None:
+        if pacing == "sync" and faults is None and every == 1 and not ends_ticks:
             self._station = station(link, self._frames, records, period_ns if clock == "lockstep" else 0)
         self._cells: Any = (self._station.cells if self._station else np.zeros(BEAT_NS + 1, np.int64)).data
 
@@ -216,6 +224,8 @@ class Node:
                 self.sync(time.monotonic_ns())
             else:
                 self.ignored["length"] += 1
+            if self._ends_ticks:
+                self._send([(*tick_over(frame.data), False)])
 
     def sync(self, now_ns: int) -> None:
         """One SYNC (or cycle): advance, latch, sample, answer."""
@@ -230,6 +240,8 @@ class Node:
         kernels.sync()
         if self._faults is not None:
             self._faults.after(kernels.state, kernels.sample)
+        self._frames.feedback = self._cycles % self._every == 0
+        self._cycles += 1
         self._send(self._frames.answer(kernels.sampled()))
 
     def _send(self, frames: Sequence[Sent]) -> None:

@@ -124,7 +124,7 @@ class ODriveFrames(Synchronous):
         drive.command(self._next(), word, torque, 0.0)
 
     def answer(self, out: dict[str, Any]) -> list[Sent]:
-        """Heartbeat, temperatures and supply when due, truth, current, speed last."""
+        """Heartbeat, temperatures and supply when due, truth; current and speed last, where they are."""
         pack, frames, self._cycles = struct.pack, [], self._cycles + 1
         self._error = int(out["error"])
         if self._cycles % BEAT_EVERY == 1:
@@ -135,10 +135,10 @@ class ODriveFrames(Synchronous):
             frames.append((self._id(BUS), pack("<ff", out["v_dc"], 0.0), False))
         if self._truth:
             frames.append((self._id(TRUTH), pack("<ff", out["T_L_true"], out["w_true"]), False))
-        frames.append((self._id(GET_IQ), pack("<ff", 0.0, out["i_q"]), False))
-        frames.append(
-            (self._id(ESTIMATES), pack("<ff", out.get("theta", 0.0) / TURN, out["w"] / TURN), False)
-        )
+        if self.feedback:
+            angle = pack("<ff", out.get("theta", 0.0) / TURN, out["w"] / TURN)
+            frames.append((self._id(GET_IQ), pack("<ff", 0.0, out["i_q"]), False))
+            frames.append((self._id(ESTIMATES), angle, False))
         return frames
 
 

@@ -192,7 +192,8 @@ def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
     u_i = config.drive_k_t if drive.takes == "torque" else 1.0
     given = speed_filter(drive.speed_filter, config.loop.rate_hz)
     known = given if getattr(drive.speed_filter, "modelled", False) else None
-    return InnerLoop(config.k_t / u_i, u_i, drive.current_lag_ms * 1e-3, drive.delay_ticks, told, known)
+    lag, every = drive.current_lag_ms * 1e-3, config.feedback_every
+    return InnerLoop(config.k_t / u_i, u_i, lag, drive.delay_ticks, told, known, every)
 
 
 def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
@@ -252,6 +253,7 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
     _slow_messages(p, config, wire)
     if inner := inner_loop(config):
         p["k_u"], p["u_i"], p["absent"] = inner.k_u, inner.u_i, wire.absent
+        p["scheduled"] = inner.every - 1
     p["absent"] |= 0 if "angle" in wire.measured else NO_ANGLE
     if config.loop.shadow:  # command and reference are somebody else's, not ours
         for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):

@@ -496,6 +496,9 @@ class FeedbackTable(Table):
     hold_ticks: Annotated[int, Field(ge=0, le=1000)] = 3
     """Periods without fresh feedback, or with an old echo, that are ridden out (STALE_FEEDBACK,
     COMMAND_LOST)."""
+    period_ms: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] | None = None
+    """How often the drive measures, where that is less often than the loop ticks: a whole multiple of its
+    period. hold_ticks then count from when a measurement was due. Left out: in each tick."""
     quick_stop_ticks: Annotated[int, Field(ge=1, le=10_000)] = 20
     """Periods of a quick stop without feedback after which it ends as a fault."""
     error_budget: Annotated[int, Field(ge=1, le=10_000)] = 8
@@ -756,6 +759,55 @@ class RunConfig(Table):
     canopen: CanopenTable | None = None
     """The CANopen drive that hil configure sets up; left out: none."""
     faults: FaultsTable = FaultsTable()
+
+    @model_validator(mode="after")
+    def _feedback_in_time(self) -> RunConfig:
+        if problem := self._seldom():
+            raise ValueError(problem)
+        return self
+
+    def _seldom(self) -> str:
+        """Why measurements may not be as seldom as feedback.period_ms says; empty when they may."""
+        given, every, tick_ms = self.feedback.period_ms, self.feedback_every, self.loop.period_ns * 1e-6
+        if given is None or (every == 1 and abs(given - tick_ms) < 1e-6 * tick_ms):
+            return ""
+        said = f"feedback.period_ms = {given:g}"
+        if abs(given - every * tick_ms) > 1e-6 * tick_ms or not every:
+            return f"{said} is no whole multiple of the loop's period, {tick_ms:g} ms; change loop.rate_hz"
+        if every > self.loop.max_gap_ticks:
+            return (
+                f"{said} is {every} ticks, longer than loop.max_gap_ticks = {self.loop.max_gap_ticks}; raise "
+                "that (64 at most), lower loop.rate_hz or let the drive send more often"
+            )
+        if given >= 250.0 * self.feedback.enable_timeout_s:
+            return (
+                f"{said}: within feedback.enable_timeout_s = {self.feedback.enable_timeout_s:g} come fewer "
+                "than four measurements; raise it or let the drive send more often"
+            )
+        return self._needs_each_tick(said)
+
+    def _needs_each_tick(self, said: str) -> str:
+        """What of this configuration rests on a measurement in each tick; empty for nothing."""
+        if self.drive.takes == "voltage":
+            return (
+                f"{said}: the drive takes voltages, and the current loop is closed over its measurements; "
+                "lower loop.rate_hz to that"
+            )
+        if self.bus.sync == "kernel":
+            return f'{said}: with bus.sync = "kernel" each SYNC is answered; take "loop"'
+        known = self.drive.speed_filter.kind != "none" and self.drive.speed_filter.modelled
+        if self.loop.pacing == "timer" and known:
+            return (
+                f'{said}: with loop.pacing = "timer" the measurements slip from tick to tick, and the states '
+                'of drive.speed_filter are not to be known; take "feedback"'
+            )
+        return ""
+
+    @property
+    def feedback_every(self) -> int:
+        """Ticks from one measurement of the drive to the next."""
+        given = self.feedback.period_ms
+        return 1 if given is None else round(given * 1e6 / self.loop.period_ns)
 
     @property
     def k_t(self) -> float:

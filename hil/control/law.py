@@ -29,7 +29,7 @@ from hil.control.mtpa import operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
 from hil.control.speed import COMMANDS, ask_speed
-from hil.control.speedfilter import PAST, ROOM, behind, filter_params, hear, innovation, order_of
+from hil.control.speedfilter import PAST, ROOM, behind, filter_params, hear, innovation, ticks_of
 
 N_MAX: Final = 1024
 """Longest window D [ticks] that the record has room for."""
@@ -115,6 +115,8 @@ LAW_PARAMS: Final = np.dtype(
         ("first", "i8", 3),
         ("R_s", "f8"),
         ("u_share", "f8"),
+        ("every", "i8"),
+        ("span", "i8"),
     ],
     align=True,
 )
@@ -124,7 +126,8 @@ takes x_hat; gains of the PI law (w, q, d); from ``rows`` on an experiment's tab
 from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hil.control.speed`); from
 ``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`); lengths of an
 adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``; R_s and the share of
-the voltage circle of :func:`mtpa_law`."""
+the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to the next where these are
+several, else 0, and ``span``: what an innovation rests on then, where there is a filter."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -132,8 +135,9 @@ _BOUNDS = ("u_start", "u_most", "goal", "w_run", "w_wrong", "i_brake")
 _INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
 _FILTER = ("order", "v_y", "v_u", "v_s", "w_y", "w_u", "w_s", "w_d", "gap_y")
 _SALIENT = ("R_s", "u_share")
+_SELDOM = ("every", "span")
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT), 0.0
+    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM), 0.0
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -316,7 +320,7 @@ def _window(spec: LawSpec, T_s: float) -> Window:
             raise ControlDesignError(f"observer kind {joint} is one for all channels: give it to both")
         whole: Window = own[0].joint(spec.speed.values(), spec.current.values(), model_of(spec, T_s))
         return whole
-    speed = _shortened(spec.speed, order_of(spec.inner), T_s)
+    speed = _shortened(spec.speed, spec.inner, T_s)
     rows = ((own[0], speed), (own[1], spec.current), (own[1], spec.current))
     model = model_of(spec, T_s)
     return side_by_side(*(_channel(o, c, i, model, T_s) for i, (o, c) in enumerate(rows)))
@@ -328,28 +332,52 @@ def _channel(observer: Any, given: ChannelSpec, index: int, model: SampledModel,
     return window
 
 
-def _shortened(given: ChannelSpec, order: int, T_s: float) -> ChannelSpec:
-    """The window that is left of D when each innovation needs ``order`` ticks itself."""
-    values = given.values()
-    if not order or given.kind == "dob" or values.get("delay_ms") is None:  # a dob has no window
+def _shortened(given: ChannelSpec, inner: InnerLoop | None, T_s: float) -> ChannelSpec:
+    """The window that is left of D when each innovation needs ticks itself, for the states of a filter."""
+    every, values = 1 if inner is None else inner.every, given.values()
+    ticks = whole_gaps(ticks_of(inner), every)
+    if given.kind == "adaptive" and (ticks or every > 1):
+        of = "without drive.speed_filter" if ticks else "in each tick, no feedback.period_ms"
+        raise ControlDesignError(
+            f"observer.speed.kind adaptive: its thresholds are those of a speed {of}; take another kind"
+            + (", or leave the filter out" if ticks else "")
+        )
+    delay = values.get("delay_ms")
+    if (not ticks and every == 1) or given.kind == "dob" or delay is None:  # a dob has no window
         return given
-    if given.kind == "adaptive":
+    left, tick_ms = delay - ticks * T_s * 1e3, T_s * 1e3
+    if left < 0.999999 * every * tick_ms:
         raise ControlDesignError(
-            "observer.speed.kind adaptive: its thresholds are those of a speed without drive.speed_filter; "
-            "take another kind, or leave the filter out"
+            f"observer.speed.delay_ms = {delay:g}: {_taken(ticks, every, tick_ms)}; take a longer one"
         )
-    left = values["delay_ms"] - order * T_s * 1e3
-    if left < 0.999999 * T_s * 1e3:
-        raise ControlDesignError(
-            f"observer.speed.delay_ms = {values['delay_ms']:g}: the states of drive.speed_filter take "
-            f"{order * T_s * 1e3:g} ms of it, and nothing is left; take a longer one"
-        )
-    return replace(given, more=values | {"delay_ms": left})
+    return replace(given, more=values | {"delay_ms": left}) if ticks else given
+
+
+def whole_gaps(ticks: int, every: int) -> int:
+    """Ticks as whole gaps between measurements: the first innovation without what was before is of such."""
+    return ticks + -ticks % every
+
+
+def _taken(ticks: int, every: int, tick_ms: float) -> str:
+    """What is taken of a window that is too short."""
+    states = f"the states of drive.speed_filter take {ticks * tick_ms:g} ms of it"
+    if every == 1:
+        return f"{states}, and nothing is left"
+    seldom = f"measurements come every {every * tick_ms:g} ms (feedback.period_ms)"
+    return (
+        f"{seldom}, {states}, and at least one must be left" if ticks else f"{seldom}, no one in the window"
+    )
 
 
 def exact_after(law: Record) -> tuple[int, int]:
-    """Ticks after its last change from which a constant d is known: speed and current channel."""
-    return int(law["N"][0, 0] + law["order"][0]), int(law["N"][0, 1])
+    """Ticks after its last change from which a constant d is known: speed and current channel.
+
+    Of a drive that measures in each m-th tick: when the change came just after a measurement, which the
+    whole of the next gap then tells as its mean.
+    """
+    N, every = int(law["N"][0, 0]), max(int(law["every"][0]), 1)
+    states = int(law["order"][0]) if every == 1 else whole_gaps(max(int(law["span"][0]) - every, 0), every)
+    return N + states + every - 1 + -N % every, int(law["N"][0, 1])
 
 
 def _check(spec: LawSpec) -> None:
@@ -406,6 +434,8 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
         "T_L_max": spec.T_L_max,
     }
     values |= law.design(spec.values(), Plan(motor, model, T_s, spec.inner))
+    if spec.inner and spec.inner.every > 1:
+        values["every"] = spec.inner.every
     gain = spec.inner.k_u / motor.J if spec.inner else 0.0
     for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
         params[name] = value
@@ -482,7 +512,7 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     does a count below 1: there is no such period, and no gap inverse that could be read for it.
     """
     if s["started"]:
-        for _ in range(0 if p["order"] else min(periods, p["max_gap"] + 1)):
+        for _ in range(0 if p["order"] and p["every"] < 2 else min(periods, p["max_gap"] + 1)):
             open_loop(p, s)
         s["gap"] += periods
         if periods < 1 or s["gap"] > p["max_gap"]:
@@ -502,7 +532,8 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
         innovate(p, s)
     for step in range(steps):
         if p["order"]:
-            s["v"][0] = innovation(p, s, (s["place"] - steps + 1 + step) % PAST)
+            ago = steps - 1 - step
+            s["v"][0] = innovation(p, s, (s["place"] - ago + ago % max(p["every"], 1)) % PAST)
         if s["filled"] == 0 and step == 0:
             fill(s["v"], s["h"], s["past"])
             if p["shaped"]:
@@ -518,6 +549,17 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
         behind(p, s)
     s["filled"] = min(s["filled"] + steps, max(p["N"][0], p["N"][1], p["N"][2]))
     start(p, s)
+
+
+@jit
+def between(p: Any, s: Any) -> None:
+    """x_w in a tick between two measurements: what the model and d_hat make of the last one.
+
+    x = x_open + (sum_{j<m} Ad^j Ed) d_hat, m ticks after it: where v is d_hat then, it is what is measured.
+    """
+    gap = s["gap"]
+    if s["started"] and 0 < gap <= p["max_gap"]:
+        s["x"][0] = s["x_open"][0] + s["d_hat"][0] / p["gap_inverse"][gap - 1, 0, 0]
 
 
 @jit

@@ -88,7 +88,8 @@ class InnerLoop:
 
     ``k_u``: torque per unit of u [N m]; ``u_i``: unit of u per ampere of i_q; ``lag`` [s]: time constant of
     the current loop; ``delay``: ticks by which a command acts later than with the next latch; ``told``: the
-    drive reports i_q; ``filter``: what the speed comes through, None: nothing that the observer is to know.
+    drive reports i_q; ``filter``: what the speed comes through, None: nothing that the observer is to
+    know; ``every``: ticks from one measurement to the next.
     """
 
     k_u: float
@@ -97,6 +98,7 @@ class InnerLoop:
     delay: int = 0
     told: bool = True
     filter: SpeedFilter | None = None
+    every: int = 1
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,9 @@ Both are exact for a d that is constant over their samples; nothing is filtered 
 n - 1 ticks more than without a filter, by which the observer's window is shorter: the whole is exact after D
 as before. To undo a filter costs noise, |r| and |p|: each pole multiplies it by (1 + l^2)^1/2 / (1 - l) and
 more, l = e^{-pole T_s}; a mean does not.
+
+Of a drive that reports in every m-th tick alone the samples are those, y_{k-jm}, with F^m in F's place; what
+flowed is known of each tick all the same. All that n counts then takes m times as long.
 """
 
 from __future__ import annotations
@@ -40,6 +43,13 @@ def order_of(inner: InnerLoop | None) -> int:
     if inner is None or inner.filter is None:
         return 0
     return inner.filter.ticks or len(inner.filter.poles)
+
+
+def ticks_of(inner: InnerLoop | None) -> int:
+    """Ticks that an innovation needs for those states, besides the one or the gap that it is of."""
+    if inner is None or inner.filter is None:
+        return 0
+    return inner.filter.ticks or len(inner.filter.poles) * inner.every
 
 
 def sampled_filter(given: SpeedFilter, friction: float, gain: float, lag: float | None, T_s: float) -> Any:
@@ -108,29 +118,34 @@ def _rows(F: Array, C: Array, count: int) -> Array:
     return np.array(rows)
 
 
-def _innovation(given: SpeedFilter, F: Array, T_s: float) -> Array:
-    """Weights r_j of y_{k-j} that no z explains: F's characteristic polynomial, of a mean (q - a) q^M."""
-    weights = np.array([1.0, -F[0, 0]])
+def _innovation(given: SpeedFilter, F: Array, T_s: float, every: int) -> Array:
+    """Weights r_j of y_{k-jm} that no z explains: characteristic polynomial of F^m, of a mean (q - a) q^M."""
+    weights = np.array([1.0, -(F[0, 0] if every == 1 else _rows(F, np.eye(len(F))[0], every + 1)[-1][0])])
     for pole in given.poles:
-        weights = np.convolve(weights, np.array([1.0, -exp(-pole * T_s)]))
+        weights = np.convolve(weights, np.array([1.0, -exp(-pole * every * T_s)]))
     return weights
 
 
-def _reconstruction(given: SpeedFilter, F: Array, C: Array) -> Array:
-    """Weights p_j of y_{k-j}, j < n, that give w_k for every z. Raises ControlDesignError."""
+def _reconstruction(given: SpeedFilter, F: Array, C: Array, every: int) -> Array:
+    """Weights p_j of y_{k-jm}, j < n, that give w_k for every z. Raises ControlDesignError."""
     n = len(F)
-    seen, first = _rows(F, C, n), np.eye(n)[0]
-    speed = _rows(F, first, n)[-1]
+    count = 1 + (given.ticks or (n - 1) * every)
+    seen, first = _rows(F, C, count), np.eye(n)[0]
+    speed = _rows(F, first, count)[-1]
     if given.ticks:  # what was before the window is forgotten: one sample tells
         return np.array([speed[0] / seen[-1][0]])
+    seen = seen[::every]
     if not condition(seen) < MOST_CONDITION:
-        raise ControlDesignError("drive.speed_filter: no number of samples tells the speed behind it")
+        told = "no number of samples tells" if every == 1 else f"measurements in each {every}th tick tell not"
+        raise ControlDesignError(
+            f"drive.speed_filter: {told} the speed behind it; let the observer not know it: modelled = false"
+        )
     back = inverse(seen)
     return np.array([dot(speed, column) for column in back.T])[::-1]
 
 
-def _known(r: Array, rows: Array, before: Array, inputs: tuple[Array, ...]) -> list[Array]:
-    """Weights of an input X of j ticks ago, beside r of the samples: wanted_j X - sum_i r_i C F^{j-i} X.
+def _known(r: Array, rows: Array, before: Array, inputs: tuple[Array, ...], every: int) -> list[Array]:
+    """Weights of an input X of j ticks ago, beside r of the samples: wanted_j X - sum_i r_i C F^{j-im} X.
 
     ``rows``: C F^j; ``before``: what is wanted of z, times F^j; j counts from the newest, 0.
     """
@@ -141,7 +156,8 @@ def _known(r: Array, rows: Array, before: Array, inputs: tuple[Array, ...]) -> l
         out.append(
             np.array(
                 [
-                    own[j] - math.fsum(r[i] * effect[j - i] for i in range(min(j + 1, len(r))))
+                    own[j]
+                    - math.fsum(r[i] * effect[j - i * every] for i in range(min(j // every + 1, len(r))))
                     for j in range(len(before))
                 ]
             )
@@ -155,17 +171,20 @@ def filter_params(inner: InnerLoop | None, friction: float, gain: float, T_s: fl
         return {}
     given = inner.filter
     _check(given, T_s)
-    lag = None if inner.told else inner.lag
+    _check_room(inner)
+    every, more = inner.every, ticks_of(inner)
+    lag = None if inner.told and every == 1 else inner.lag  # between two samples the model tells what flows
     F, G, S, E, C = sampled_filter(given, friction, gain, lag, T_s)
     n = len(F)
-    rows, none = _rows(F, C, MAX_GAP), np.zeros((n, n))
-    r, p = _innovation(given, F, T_s), _reconstruction(given, F, C)
-    v_u, v_s, v_d = _known(r, rows, none, (G, S, E))
-    w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n)[: n - 1], (G, S, E))
+    rows, none = _rows(F, C, MAX_GAP), np.zeros((more + every, n))
+    r, p = _innovation(given, F, T_s, every), _reconstruction(given, F, C, every)
+    v_u, v_s, v_d = _known(r, rows, none, (G, S, E), every)
+    w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n * every)[:more], (G, S, E), every)
     scale = -math.fsum(v_d)
     steps = np.array([dot(row, E) for row in rows])
     return {
         "order": n - 1,
+        "span": more + every if every > 1 else 0,
         "v_y": _padded(r / scale),
         "v_u": _padded(v_u / scale),
         "v_s": _padded(v_s / scale),
@@ -198,6 +217,17 @@ def _check(given: SpeedFilter, T_s: float) -> None:
         )
 
 
+def _check_room(inner: InnerLoop) -> None:
+    """Refuse measurements so seldom that the record has no room for what they rest on."""
+    need = ticks_of(inner) + inner.every
+    if inner.every > 1 and need > ROOM:
+        raise ControlDesignError(
+            f"feedback.period_ms: to know the states of drive.speed_filter takes {need} ticks of "
+            f"measurements in each {inner.every}th tick, and {ROOM} are kept; lower loop.rate_hz, or let the "
+            "observer not know the filter: modelled = false"
+        )
+
+
 @jit
 def enter(s: Any, u: float, bend: float) -> None:
     """Begin the next place of the ring: a period with the constant current u, in which it changed by bend."""
@@ -216,11 +246,18 @@ def inputs_of(s: Any, place: int, count: int, by_u: Any, by_bend: Any) -> float:
 
 
 @jit
+def span_of(p: Any) -> int:
+    """Ticks that an innovation rests on."""
+    return int(p["span"] if p["every"] > 1 else p["order"] + 1)
+
+
+@jit
 def innovation(p: Any, s: Any, place: int) -> float:
     """v at the end of the period at ``place``."""
-    total = inputs_of(s, place, p["order"] + 1, p["v_u"], p["v_s"])
-    for j in range(p["order"] + 2):
-        total += p["v_y"][j] * s["y"][(place - j) % PAST]
+    every, span = max(p["every"], 1), span_of(p)
+    total = inputs_of(s, place, span, p["v_u"], p["v_s"])
+    for j in range(span // every + 1):
+        total += p["v_y"][j] * s["y"][(place - j * every) % PAST]
     return total
 
 
@@ -230,12 +267,13 @@ def bridge(p: Any, s: Any, gap: int, y: float) -> None:
 
     With d_hat as it was each would be what makes v = d_hat.
     """
-    for j in range(gap - 1, -1, -1):
+    every = max(p["every"], 1)
+    for j in range(gap - every, -1, -every):
         at = (s["place"] - j) % PAST
         s["y"][at] = 0.0
         s["y"][at] = (s["d_hat"][0] - innovation(p, s, at)) / p["v_y"][0]
     off = (y - s["y"][s["place"]]) / p["gap_y"][gap - 1]
-    for j in range(gap - 1, 0, -1):
+    for j in range(gap - every, 0, -every):
         s["y"][(s["place"] - j) % PAST] += off * p["gap_y"][gap - 1 - j]
 
 
@@ -243,12 +281,13 @@ def bridge(p: Any, s: Any, gap: int, y: float) -> None:
 def hear(p: Any, s: Any) -> int:
     """Take the reported speed s['x'][0] after s['gap'] periods; return for how many of them there is a v.
 
-    None until there are samples enough, after a start; the observer waits.
+    None until there are samples enough, after a start, and after a gap of no whole number of samples; the
+    observer waits.
     """
-    y, gap, n = s["x"][0], s["gap"], p["order"] + 1
-    if gap > 1 and s["heard"] <= n:
+    y, gap, n, every = s["x"][0], s["gap"], span_of(p), max(p["every"], 1)
+    if gap % every or (gap > every and s["heard"] <= n):
         s["heard"] = 0
-    elif gap > 1:
+    elif gap > every:
         bridge(p, s, gap, y)
     s["y"][s["place"]] = y
     s["heard"] = min(s["heard"] + gap if s["heard"] else 1, PAST)
@@ -258,9 +297,10 @@ def hear(p: Any, s: Any) -> int:
 @jit
 def behind(p: Any, s: Any) -> None:
     """Write the speed behind the filter to s['x'][0]; what is reported as long as samples are too few."""
-    n = p["order"] + 1
-    if s["heard"] >= n:
-        w = inputs_of(s, s["place"], n - 1, p["w_u"], p["w_s"]) + p["w_d"] * s["d_hat"][0]
-        for j in range(n):
-            w += p["w_y"][j] * s["y"][(s["place"] - j) % PAST]
+    every = max(p["every"], 1)
+    more = span_of(p) - every
+    if s["heard"] > more:
+        w = inputs_of(s, s["place"], more, p["w_u"], p["w_s"]) + p["w_d"] * s["d_hat"][0]
+        for j in range(more // every + 1):
+            w += p["w_y"][j] * s["y"][(s["place"] - j * every) % PAST]
         s["x"][0] = w

@@ -11,7 +11,7 @@ from hil.control.law import MTPA, N_MAX, ROWS
 from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
-from hil.control.speedfilter import MOST_AVERAGE, PAST
+from hil.control.speedfilter import MOST_AVERAGE, PAST, ROOM
 from hil.log.named import Record
 from hil.signals import DriveState
 from hil.tick.guard import MOST_MESSAGES, MOST_PERIODS
@@ -30,6 +30,8 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "order": (0, MOST_AVERAGE),
         "short": (0, FIR_MAX),
         "first": (0, FIR_MAX),
+        "every": (0, MAX_GAP),
+        "span": (0, ROOM),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {
@@ -70,3 +72,5 @@ def check_ranges(kind: str, record: Record) -> None:
         raise ValueError(f"law.first, short, N are {first[0]}, {short[0]}, {N[0]}: they do not grow from 1")
     if np.any(record["order"]) and not (record["v_y"][0, 0] and record["gap_y"][0].all()):
         raise ValueError("law.v_y or law.gap_y is 0, by which a kernel divides")
+    if np.any((record["every"] > 1) & (record["order"] > 0) & (record["span"] < record["every"])):
+        raise ValueError(f"law.span is {record['span'][0]}, shorter than law.every = {record['every'][0]}")

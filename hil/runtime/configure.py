@@ -117,6 +117,7 @@ def job_of(path: Path, config: RunConfig, bus: BusSettings) -> Job:
         tpdo=_places(table.tpdo),
         sync_period=table.sync_period,
         rpdo_timeout_ms=table.rpdo_timeout_ms,
+        every=config.feedback_every,
     )
     return Job(config, table, path.parent, eds, plan_of(eds, config.drive.node_id, wish), bus)
 

@@ -52,6 +52,7 @@ from hil.runtime.loop import (
     BEGUN,
     COUNTER_JUMP,
     DECIDED,
+    FRESH,
     HEARD,
     MAX_NS,
     NEVER,
@@ -63,6 +64,7 @@ from hil.runtime.loop import (
     Pace,
     Plan,
     Whole,
+    is_due,
     missed,
     none_compiled,
     wait_ns,
@@ -90,7 +92,7 @@ I8: Final = np.dtype(np.int64)
 
 RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, ROWS = range(12)
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
-PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS = range(5)
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS, EVERY = range(6)
 
 
 def whole_tick(
@@ -112,8 +114,11 @@ def whole_tick(
         return none_compiled
     end = NEVER if plan.ticks is None else plan.ticks
     timing = np.array(
-        [plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None)]
-    )
+        [
+            plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None),
+            plan.every,
+        ]
+    )  # fmt: skip
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks = np.zeros(0, np.int64) if marks is None else marks
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
@@ -128,7 +133,7 @@ def whole_tick(
 def _compiled(kernel: Any) -> Callable[..., int]:
     """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(WAIT_NS + 1, np.int64)}
+    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(EVERY + 1, np.int64)}
     for row, array in known.items():
         table[row] = place_of(array, I8)
     compiled: Callable[..., int] = entry(kernel, table, 0, 0, 0, False)
@@ -191,7 +196,7 @@ def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_faile
 
 
 @jit
-def read(table: Any, t: Any, deadline_ns: int) -> Any:
+def read(table: Any, t: Any, deadline_ns: int, due: bool) -> Any:
     """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
     words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
     places, times = places_at(table, RECEIVE), array_at(table, TIMES_AT, I8)
@@ -200,7 +205,7 @@ def read(table: Any, t: Any, deadline_ns: int) -> Any:
         words[BEAT_NS] = now_ns(times)
         if words[FIRED] != 0:
             return NOT_BEGUN
-    code = exchange(places, plan[SYNC_BYTES], deadline_ns + plan[TIMEOUT_NS])
+    code = exchange(places, plan[SYNC_BYTES], deadline_ns + (plan[TIMEOUT_NS] if due else 0))
     if code == PENDING:
         return NOT_BEGUN
     if code != DONE:
@@ -247,13 +252,15 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
     woken_ns = sleep_until(deadline_ns, times)
     mark(marks, SLEEP, times)
     late_ns = woken_ns - deadline_ns
-    if late_ns < 0 or late_ns >= array_at(table, PLAN, I8)[PERIOD_NS]:
+    plan = array_at(table, PLAN, I8)
+    if late_ns < 0 or late_ns >= plan[PERIOD_NS]:
         return NOT_BEGUN
     ticks = array_at(table, TICK_AT, TICK)
     t = ticks[0]
     request = t["request"]
+    due = is_due(array_at(table, PACE, I8), t["rx_flags"] & np.uint32(FRESH), t["gap"], plan[EVERY])
     stamp(t, k, deadline_ns, woken_ns, asked, log_failed)
-    stage = read(table, t, deadline_ns)
+    stage = read(table, t, deadline_ns, due)
     mark(marks, READ, times)
     if stage < DECIDED:
         return stage
@@ -314,8 +321,9 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
     t = ticks[0]
     request = t["request"]
+    due = is_due(pace, t["rx_flags"] & np.uint32(FRESH), t["gap"], plan[EVERY])
     stamp(t, k, deadline_ns, deadline_ns, asked, log_failed)
-    count = follow(places, pace[ARRIVED] + plan[WAIT_NS], QUEUE_MOST)
+    count = follow(places, pace[ARRIVED] + plan[WAIT_NS if due else PERIOD_NS], QUEUE_MOST)
     mark(marks, READ, times)
     if count == WAITS:
         return NOT_BEGUN

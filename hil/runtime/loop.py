@@ -26,8 +26,8 @@ Whole = Callable[[int, int, int, bool], int]
 log failed; see :mod:`hil.runtime.fused`. It returns the stage that it reached."""
 Pace = npt.NDArray[np.int64]
 """ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many a compiled tick has taken
-of a queue that it left to the loop."""
-ARRIVED, HEARD = range(2)
+of a queue that it left to the loop; SINCE: periods from the last tick with feedback to the one before."""
+ARRIVED, HEARD, SINCE = range(3)
 NOT_BEGUN, BEGUN, DECIDED, SENT, RECORDED = range(5)
 """Stages of a tick: SYNC is not out; SYNC is out, the drive has feedback to conclude; the law has run; the
 command is out, where there is one; the record is stored. What is left is done here."""
@@ -43,7 +43,7 @@ ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 
 
 RAMP_DOWN, STOP = int(Request.RAMP_DOWN), int(Request.STOP)
-BUS_DOWN, SEND_FAILED = int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
+FRESH, BUS_DOWN, SEND_FAILED = int(RxFlag.FRESH), int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
 NEVER = 2**63 - 1
 STEER_EVERY = 64
 """Periods between two looks at the phase of a SYNC that the kernel times."""
@@ -56,7 +56,10 @@ def bounded(ns: int) -> int:
 
 
 def wait_ns(plan: Plan, timed: bool) -> int:
-    """How long after the last feedback, or the last SYNC of the kernel's, the next is waited for."""
+    """How long after the last feedback, or the last SYNC of the kernel's, the next is waited for.
+
+    Where none is due a tick begins when it would have been due: :func:`is_due`.
+    """
     return plan.period_ns + plan.timeout_ns if timed else plan.period_ns * 3 // 2
 
 
@@ -78,12 +81,16 @@ class StopRequest:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Timing of a run: period and feedback timeout [ns], pacing, length in ticks (None: until stopped)."""
+    """Timing of a run: period and feedback timeout [ns], pacing, length in ticks (None: until stopped).
+
+    ``every``: ticks from one feedback to the next.
+    """
 
     period_ns: int
     timeout_ns: int
     pacing: Pacing
     ticks: int | None
+    every: int = 1
 
 
 @dataclass(slots=True)
@@ -100,7 +107,7 @@ class Outcome:
 
 def new_pace() -> Pace:
     """All zero."""
-    return np.zeros(HEARD + 1, np.int64)
+    return np.zeros(SINCE + 1, np.int64)
 
 
 def none_compiled(_k: int, _deadline_ns: int, _asked: int, _log_failed: bool) -> int:
@@ -130,6 +137,16 @@ def missed(heard: int, jumped: int, late_ns: int, period_ns: int) -> int:
     if heard and not jumped:
         return queued
     return max(queued, (late_ns + (period_ns // 2 if heard else 0)) // period_ns)
+
+
+@register_jitable
+def is_due(pace: Any, fresh: int, gap: int, every: int) -> bool:
+    """Whether this tick is to have feedback; ``fresh``, ``gap``: of the tick before.
+
+    Once it has not come when it was due, each tick is to.
+    """
+    pace[SINCE] = 0 if fresh else pace[SINCE] + gap
+    return bool(pace[SINCE] + 1 >= every)
 
 
 class Cells:
@@ -245,7 +262,7 @@ class Loop:
         if stage == NOT_BEGUN:
             k = self._on_time(tick, k, deadline_ns)
         elif stage == BEGUN:
-            k = self._one(tick, k, deadline_ns, 1, deadline_ns + self._cells.lateness_ns[0])
+            k = self._one(tick, k, deadline_ns, 1, deadline_ns + self._cells.lateness_ns[0], begun=True)
         else:
             if stage == DECIDED:
                 self._answer(tick, deadline_ns)
@@ -270,18 +287,22 @@ class Loop:
         self._outcome.skipped += skipped
         return k + skipped, 1 + skipped
 
-    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> int:
-        """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on."""
+    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int, begun: bool = False) -> int:
+        """Read, judge, compute, write, record; return k, which a queue of feedback may have moved on.
+
+        ``begun``: by a compiled tick, which has counted it.
+        """
         now, t = self._clock.now_ns, self._cells
+        due = begun or is_due(self._pace, t.rx_flags[0] & FRESH, t.gap[0], self._plan.every)
         self._stamp(k, deadline_ns, gap, now_ns)
         if not self._pace[HEARD]:
             t.rx_flags[0], t.missing[0] = 0, ALL_MISSING
         if self._sends_sync:
-            self._exchange(tick, deadline_ns)
+            self._exchange(tick, deadline_ns, due)
         elif self._plan.pacing == "timer":
             self._drive.receive(tick, 0)
         else:
-            k, deadline_ns = self._newest_feedback(tick, k, deadline_ns)
+            k, deadline_ns = self._newest_feedback(tick, k, deadline_ns, due)
         t.received_ns[0] = bounded(now() - deadline_ns)
         if self._plan.pacing == "timer":
             self._note_age(deadline_ns)
@@ -318,7 +339,7 @@ class Loop:
             self._outcome.state, self._outcome.reason = t.state[0], t.reason[0]
             self._ended = t.state[0] in ENDED
 
-    def _newest_feedback(self, tick: Any, k: int, deadline_ns: int) -> tuple[int, int]:
+    def _newest_feedback(self, tick: Any, k: int, deadline_ns: int, due: bool = True) -> tuple[int, int]:
         """Wait for cyclic feedback; of several that queued up the newest counts, the others as skipped.
 
         Each feedback is one period of the drive's clock, and so is each that is missing: k follows the time.
@@ -330,7 +351,8 @@ class Loop:
         if not k:
             pace[ARRIVED] = self._clock.now_ns()
         heard, pace[HEARD] = pace[HEARD], 0
-        until_ns = self._clock.receive_deadline(pace[ARRIVED], wait_ns(plan, self._timed is not None))
+        wait = wait_ns(plan, self._timed is not None) if due else plan.period_ns
+        until_ns = self._clock.receive_deadline(pace[ARRIVED], wait)
         drive.receive(tick, NO_WAIT if heard else until_ns)
         while flags[0] & fresh and heard < QUEUE_MOST:
             heard += 1
@@ -369,10 +391,11 @@ class Loop:
         t.request[0] = self._asked(k)
         t.log_failed[0] = self._recorder.failed
 
-    def _exchange(self, tick: Any, deadline_ns: int) -> None:
-        """SYNC out and feedback in."""
+    def _exchange(self, tick: Any, deadline_ns: int, due: bool) -> None:
+        """SYNC out and feedback in; where none is due, what is there."""
+        wait = self._plan.timeout_ns if due else 0
         try:
-            self._drive.exchange(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
+            self._drive.exchange(tick, self._clock.receive_deadline(deadline_ns, wait))
         except OSError as error:
             self._cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
 

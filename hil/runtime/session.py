@@ -242,7 +242,7 @@ def plan_of(config: RunConfig) -> Plan:
     ticks = None if loop.duration_s is None else round(loop.duration_s * loop.rate_hz)
     follows = loop.pacing == "sync" and (loop.shadow or config.bus.sync == "kernel")
     pacing = "feedback" if follows else loop.pacing
-    return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks)
+    return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks, config.feedback_every)
 
 
 def _run_armed(

@@ -116,7 +116,7 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     load = config.controller.kind == "fac"
     parts = drive_map(config, database, str(path))
     asked = parts.sync or parts.poll  # then it answers as often as that
-    period_ms = None if asked else config.loop.period_ns * 1e-6
+    period_ms = None if asked else config.feedback_every * config.loop.period_ns * 1e-6
     if parts.sync and parts.sync == parts.step:  # lockstep: it paces the loop
         loop = config.loop.model_copy(update={"pacing": "sync"})
         config = config.model_copy(update={"loop": loop})
@@ -167,6 +167,9 @@ def _check_pacing(path: Path, config: RunConfig, binding: Binding, kind: DriveKi
         raise ConfigError(
             str(path), ['loop.pacing: the drive answers each command (drive.signals.poll); take "sync"']
         )
+    if (binding.map.poll or kind.asked) and config.feedback_every > 1:
+        what = "the drive answers each command" if binding.map.poll else "the drive answers each request"
+        raise ConfigError(str(path), [f"feedback.period_ms: {what} (in each tick); remove it"])
     if binding.opener is None and config.loop.clock == "lockstep":
         raise ConfigError(str(path), ['loop.clock: a drive without SYNC keeps its own time; take "realtime"'])
     if binding.opener is None and config.loop.pacing == "sync":

@@ -59,6 +59,8 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
         protocol=plant.protocol,
         eds=eds,
         faults=PlantFaults(plant.fault, params, modulus - 1, acted) if watched else None,
+        every=plant.feedback_every,
+        ends_ticks=lockstep and config.feedback_every > 1 and faulty is None,
     )
     if faulty is not None:
         faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time

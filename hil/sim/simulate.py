@@ -52,19 +52,27 @@ NO_COLUMNS: Final = Columns(0)
 
 
 @jit
-def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int, messages: int) -> None:
+def receive(pp: Any, ps: Any, out: Any, t: Any, absent: int, messages: int, fresh: bool) -> None:
     """SYNC to the drive, its answer into the tick's inputs, as codec and client do it.
 
-    ``messages``: slow ones that the map reads; they come together.
+    ``messages``: slow ones that the map reads; they come together. ``fresh``: it measures in this tick.
     """
     o = out[0]
     on_sync(pp[0], ps[0], o)
-    t["w"] = o["w"]
-    t["i_q"] = math.nan if absent & NO_I_Q else o["i_q"]
-    t["i_d"] = math.nan if absent & NO_I_D else o["i_d"]
-    t["theta"] = math.nan if absent & NO_ANGLE else o["theta"]
-    t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
-    t["rx_flags"], t["missing"] = RxFlag.FRESH.value, ALL_MISSING
+    t["rx_flags"], t["missing"] = 0, ALL_MISSING
+    if absent & NO_I_Q:
+        t["i_q"] = math.nan
+    if absent & NO_I_D:
+        t["i_d"] = math.nan
+    if absent & NO_ANGLE:
+        t["theta"] = math.nan
+    if fresh:
+        t["rx_flags"] = RxFlag.FRESH.value
+        t["w"] = o["w"]
+        t["i_q"] = math.nan if absent & NO_I_Q else o["i_q"]
+        t["i_d"] = math.nan if absent & NO_I_D else o["i_d"]
+        t["theta"] = math.nan if absent & NO_ANGLE else o["theta"]
+        t["echo"], t["drive_state"], t["limited"] = o["echo"], o["state"], o["limited"]
     t["T_L_true"] = o["T_L_true"]
     if o["emcy_due"]:
         t["rx_flags"] |= RxFlag.EMERGENCY.value
@@ -115,6 +123,7 @@ def simulate_block(
     k: int,
     period_ns: int,
     stop_at: int,
+    every: int,
 ) -> int:
     """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended.
 
@@ -134,7 +143,7 @@ def simulate_block(
         t["t_ns"] = (k + i) * period_ns
         t["gap"] = 1
         t["request"] = Request.STOP.value if k + i >= stop_at else Request.ARM.value
-        receive(pp, ps, out, t, sp[0]["absent"], sp[0]["messages"])
+        receive(pp, ps, out, t, sp[0]["absent"], sp[0]["messages"], (k + i) % every == 0)
         prepare(rp, gp, gs, ss, lp, now)
         step(sp, ss, lp, ls, now)
         deliver(lp, ps, t)
@@ -160,6 +169,8 @@ class Simulation:
     plant_state: Record
     stop_at: int
     machine: Machine
+    every: int = 1
+    """Ticks from one measurement of the plant to the next."""
 
     def blocks(self) -> Any:
         """Yield tick arrays of up to BLOCK ticks until the run has ended; each is overwritten by the next."""
@@ -198,7 +209,7 @@ class Simulation:
                 machine.safety, machine.safety_state, machine.law, machine.law_state, machine.reference,
                 machine.setpoint, machine.setpoint_state,
                 self.plant, self.plant_state, out, tick, ticks,
-                room.floats, room.integers, room.stop, k, period_ns, self.stop_at,
+                room.floats, room.integers, room.stop, k, period_ns, self.stop_at, self.every,
             )  # fmt: skip
 
         return into
@@ -211,7 +222,7 @@ def compiled_block() -> Callable[..., int]:
     kinds = (*controller, SETPOINT_PARAMS, SETPOINT_STATE, PARAMS, STATE, SAMPLE)
     records = [np.zeros(1, kind) for kind in kinds]
     room = NO_COLUMNS.floats, NO_COLUMNS.integers, NO_COLUMNS.stop
-    return entry(simulate_block, *records, new_ticks(), new_ticks(0), *room, 0, 1, 0)
+    return entry(simulate_block, *records, new_ticks(), new_ticks(0), *room, 0, 1, 0, 1)
 
 
 def make_simulation(setup: Setup, plant_settings: list[str]) -> Simulation:
@@ -230,7 +241,8 @@ def simulation_of(setup: Setup, plant: PlantConfig, wire: Wire) -> Simulation:
         raise ConfigError(str(setup.path), ["fault: a fault script needs the bus; use hil run or hil faults"])
     params = build_params(plant, wire)
     state = new_state(params, setup.wire.counter_modulus - 1)
-    return Simulation(setup, params, state, ticks, setup.machine.fresh())
+    every = setup.config.feedback_every if plant.protocol == "cia402" else plant.feedback_every
+    return Simulation(setup, params, state, ticks, setup.machine.fresh(), every)
 
 
 def simulate_ticks(setup: Setup, plant_settings: list[str] | None = None) -> TickArray:

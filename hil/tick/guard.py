@@ -59,6 +59,7 @@ SAFETY_PARAMS: Final = np.dtype(
         ("k_u", "f8"),
         ("u_i", "f8"),
         ("absent", "i8"),
+        ("scheduled", "i8"),
     ],
     align=True,
 )
@@ -68,7 +69,8 @@ SAFETY_PARAMS: Final = np.dtype(
 of the drive's map, whose age may be ``age_max`` periods; ``carried_by``: what v_dc, motor and inverter
 temperature come with, as bits of ``came``, 0 for what the drive does not send. ``k_u``: torque per unit of
 the command of a drive that takes a current or a torque, ``u_i`` that unit per ampere; 0 for voltages.
-``absent``: what the drive does not report, NO_I_Q, NO_I_D and NO_ANGLE.
+``absent``: what the drive does not report, NO_I_Q, NO_I_D and NO_ANGLE. ``scheduled``: ticks from one
+measurement to the next that have none, as planned; hold times begin after them.
 """
 NO_I_Q: Final = 1
 NO_I_D: Final = 2
@@ -80,7 +82,7 @@ MOST_PERIODS: Final = 1024
 """Periods since the last measurement that are still counted; no run in operation waits so long."""
 
 SAFETY_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    ("rules", "messages", "age_max", "carried_by", "k_u", "u_i", "absent"), 0
+    ("rules", "messages", "age_max", "carried_by", "k_u", "u_i", "absent", "scheduled"), 0
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 

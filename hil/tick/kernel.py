@@ -20,6 +20,7 @@ from hil.control.law import (
     SPEED,
     apply,
     ask,
+    between,
     is_saturated,
     observe,
     reset,
@@ -79,6 +80,8 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     periods = min(int(t["gap"]), int(lp["max_gap"]) + 1)
     ls["ua"][0] = flowed(lp, ls, t["i_q"] * lp["u_i"], heard and told, periods)
     observe(lp, ls, t["w"], 0.0, 0.0, heard, t["gap"])
+    if lp["every"] > 1 and not heard:
+        between(lp, ls)
     t["ua_q"], t["ua_d"] = ls["ua"][0], 0.0
     applied_now(p, s, t)
     latched(lp, ls, s["ua_q"], not fresh or t["drive_state"] == DriveState.OPERATION_ENABLED)
@@ -116,7 +119,7 @@ def circle(p: Any, s: Any, lp: Any, t: Any) -> float:
 
 @jit
 def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> Any:
-    """Ask the law for the next command; without fresh feedback hold the last one.
+    """Ask the law for the next command; without feedback that was due hold the last one.
 
     Returns (u_q, u_d, T_L) in the voltage circle, NaN where the law asks for what is no number, and the flag
     of a law that is at a limit. Version 0 of the rules records what is asked for after the circle, without
@@ -126,7 +129,8 @@ def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> Any:
         t["u_q_law"], t["u_d_law"], t["T_L_law"] = 0.0, 0.0, 0.0
         t["i_q_ref"], t["i_d_ref"] = 0.0, 0.0
         return 0.0, 0.0, 0.0, 0
-    if not (t["rx_flags"] & RxFlag.FRESH and ls["started"]):
+    known = t["rx_flags"] & RxFlag.FRESH or 0 < ls["gap"] < lp["every"]
+    if not (known and ls["started"]):
         t["u_q_law"], t["u_d_law"], t["T_L_law"] = s["u_q"], s["u_d"], s["T_L"]
         t["i_q_ref"], t["i_d_ref"] = ls["i_q_ref"], ls["i_d_ref"]
         return s["u_q"], s["u_d"], s["T_L"], 0

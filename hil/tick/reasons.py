@@ -81,6 +81,10 @@ def _period_ms(p: Any, s: Any, t: Any) -> float:
     return 1e3 * float(p["T_s"])
 
 
+def _hold_ms(p: Any, s: Any, t: Any) -> float:
+    return (float(p["hold_ticks"]) + float(p["scheduled"])) * _period_ms(p, s, t)
+
+
 def _hottest(p: Any, s: Any, t: Any) -> float:
     return max((float(t[n]) for n in _TEMPERATURES if math.isfinite(t[n])), default=math.nan)
 
@@ -132,7 +136,7 @@ CAUSES: Final[dict[Reason, Cause]] = {
         "a quick stop was asked for: a second Ctrl-C or signal", "nothing to do", fault=False),
     Reason.STALE_FEEDBACK: Cause(
         "no fresh feedback", "look at cable, supply and node id; candump shows whether the drive still sends",
-        "feedback.hold_ticks", "ms", _state("stale_at", _period_ms), _limit("hold_ticks", _period_ms),
+        "feedback.hold_ticks", "ms", _state("stale_at", _period_ms), _hold_ms,
         fault=False),
     Reason.NOT_A_NUMBER: Cause(
         "a measured signal is no number", "look at the drive's sensor, and at the signal's type in the DBC",
@@ -209,7 +213,7 @@ CAUSES: Final[dict[Reason, Cause]] = {
     Reason.COMMAND_LOST: Cause(
         "the drive does not answer to the last command",
         "commands are lost, or what comes is old: look at the bus load",
-        "feedback.hold_ticks", "ms", _state("lagging", _period_ms), _limit("hold_ticks", _period_ms)),
+        "feedback.hold_ticks", "ms", _state("lagging", _period_ms), _hold_ms),
     Reason.FROZEN_FEEDBACK: Cause(
         "the readings stand still although the voltage moved",
         "look at encoder, current sensors and firmware",

@@ -91,12 +91,15 @@ def judge_drive(s: Any, t: Any) -> int:
 
 @jit
 def judge_timing(p: Any, s: Any, t: Any) -> int:
-    """Count ticks without fresh feedback; return the Reason once the hold time is over."""
+    """Count ticks without fresh feedback; return the Reason once the hold time is over.
+
+    It begins when feedback is due.
+    """
     if t["rx_flags"] & RxFlag.FRESH:
         s["stale"] = 0
     else:
         s["stale"] += t["gap"]
-    if s["stale"] > p["hold_ticks"]:
+    if s["stale"] > p["hold_ticks"] + p["scheduled"]:
         return Reason.STALE_FEEDBACK.value
     if t["gap"] > p["max_gap"]:
         return Reason.LOOP_OVERRUN.value
@@ -109,15 +112,16 @@ def judge_echo(p: Any, s: Any, t: Any) -> int:
 
     Either the drive does not get the commands, or what comes is the answer to an older SYNC: both make
     feedback that is good frame by frame worthless. An echo that stands still does not count as right when
-    the command's counter comes round to it.
+    the command's counter comes round to it; where it comes round from one feedback to the next it may.
     """
     if p["shadow"] or not t["rx_flags"] & RxFlag.FRESH:
         return Reason.NONE.value
     lag = (int(s["counter"]) - int(t["echo"])) % int(p["counter_modulus"])
-    right = lag <= p["echo_lag"] and t["echo"] != s["echo"]
+    round_again = p["scheduled"] > 0 and (p["scheduled"] + 1) % p["counter_modulus"] == 0
+    right = lag <= p["echo_lag"] and (round_again or t["echo"] != s["echo"])
     s["lagging"] = grown(s["lagging"], not right, s["elapsed"])
     s["echo"] = t["echo"]
-    return Reason.COMMAND_LOST.value if s["lagging"] > p["hold_ticks"] else Reason.NONE.value
+    return Reason.COMMAND_LOST.value if s["lagging"] > p["hold_ticks"] + p["scheduled"] else Reason.NONE.value
 
 
 @jit
@@ -205,7 +209,8 @@ def begin_stop(s: Any, reason: int) -> None:
 def handshake(p: Any, s: Any, t: Any) -> int:
     """Follow the drive through its enable handshake; return the controlword for its state.
 
-    A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words. Without
+    A drive that stands in FAULT is reset by a rising edge of bit 7, made of two alternating words, by the
+    tick's number, or from one feedback to the next where these are several ticks apart. Without
     fresh feedback the last word stands: another would undo the step that the drive may just have made. It is
     switched on, but not enabled before each slow message has come.
     """
@@ -226,6 +231,8 @@ def handshake(p: Any, s: Any, t: Any) -> int:
             return Controlword.SWITCH_ON.value
         if t["drive_state"] == DriveState.FAULT:
             odd = s["armed_ticks"] % 2 == 1
+            if p["scheduled"] > 0:
+                odd = s["word"] != Controlword.FAULT_RESET
             return Controlword.FAULT_RESET.value if odd else Controlword.DISABLE_VOLTAGE.value
     return Controlword.SHUTDOWN.value
 
@@ -279,11 +286,12 @@ def stopping(p: Any, s: Any, t: Any) -> int:
     """One tick of a stop: zero voltage and quick stop until the drive has left operation, then disable."""
     s["stop_ticks"] += 1
     judge_timing(p, s, t)
-    if s["state"] == DriveState.QUICK_STOP_ACTIVE and s["stale"] > p["quick_stop_ticks"]:
+    if s["state"] == DriveState.QUICK_STOP_ACTIVE and s["stale"] > p["quick_stop_ticks"] + p["scheduled"]:
         s["state"] = DriveState.FAULT_REACTION_ACTIVE.value
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
     left = fresh and t["drive_state"] != DriveState.OPERATION_ENABLED
-    if (left and s["stop_ticks"] >= 3) or s["stop_ticks"] >= STOP_TICKS + p["quick_stop_ticks"]:
+    most = STOP_TICKS + p["quick_stop_ticks"] + p["scheduled"]
+    if (left and s["stop_ticks"] >= 3) or s["stop_ticks"] >= most:
         quick = s["state"] == DriveState.QUICK_STOP_ACTIVE
         s["state"] = DriveState.SWITCH_ON_DISABLED.value if quick else DriveState.FAULT.value
         return Controlword.DISABLE_VOLTAGE.value

@@ -2,7 +2,8 @@
 
 The very kernels of the tick against the exact sampled plant x = (w, i, filter), without limits and rounding;
 i in the unit of the command. S is that of the reported speed: from a step that nobody filtered to what the
-observer gets; Ms and margins follow as in :mod:`hil.tuning.measure`.
+observer gets; Ms and margins follow as in :mod:`hil.tuning.measure`. Of a drive that measures in each m-th
+tick S is that of its samples, which is the loop's own at their rate; what lies between them the law predicts.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from hil.control.jit import jit
-from hil.control.law import MotorModel, ask, new_law_state, observe, reset
+from hil.control.law import MotorModel, ask, between, new_law_state, observe, reset
 from hil.control.linalg import Array
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speed import COMMANDS, flowed, latched
@@ -75,17 +76,23 @@ def _mean(shaft: Shaft, ticks: int, T_s: float) -> Shaft:
 
 @jit
 def respond_current(p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind: int, out: Array) -> None:
-    """The loop's response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on."""
-    n, K = A.shape[0], out.shape[1]
+    """The loop's response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on.
+
+    It begins with a measurement.
+    """
+    n, K, every = A.shape[0], out.shape[1], max(p["every"], 1)
     x, new, way = np.zeros(n), np.zeros(n), np.zeros(COMMANDS)
     reset(s)
     latched(p, s, 0.0, False)
-    for k in range(-QUIET, K):
+    for k in range(-QUIET * every, K):
+        fresh = k % every == 0
         y = 1.0 if kind == PULSE_W and k == 0 else 0.0
         for c in range(n):
             y += C[c] * x[c]
-        s["ua"][0] = flowed(p, s, x[1], p["told"] != 0, 1)
-        observe(p, s, y, 0.0, 0.0, True, 1)
+        s["ua"][0] = flowed(p, s, x[1], fresh and p["told"] != 0, 1)
+        observe(p, s, y, 0.0, 0.0, fresh, 1)
+        if not fresh:
+            between(p, s)
         latched(p, s, way[0], True)
         ask(p, s, 0.0, 0.0, 0.0, NO_LIMIT)
         acts = way[p["delay"]]
@@ -130,8 +137,9 @@ def loop_of(law: Record, shaft: Shaft, T_s: float) -> Loop:
     if not all(_at_rest(row) for row in (step[2], pulse[0], pulse[1])):
         return Loop(False)
     u, seen, _, d = pulse
-    d_noise, u_noise = (math.sqrt(float((row**2).sum())) for row in (d, u))
-    return Loop(True, peak_of(seen), margins_of(seen, T_s), d_noise, u_noise)
+    every = max(int(law["every"][0]), 1)
+    d_noise, u_noise = (math.sqrt(float((row**2).sum()) / every) for row in (d, u))
+    return Loop(True, peak_of(seen[::every]), margins_of(seen[::every], every * T_s), d_noise, u_noise)
 
 
 def _at_rest(response: Array) -> bool:

@@ -22,6 +22,7 @@ from hil.control.law import (
     LawSpec,
     MotorModel,
     ask,
+    between,
     design_law,
     exact_after,
     new_law_state,
@@ -116,9 +117,11 @@ def drive(
     for k in range(ticks):
         if k == change[0]:
             shaft.z[-1] = change[1]
-        heard = k not in lost
+        heard = k not in lost and k % max(p["every"], 1) == 0
         s["ua"][0] = flowed(p, s, 0.0, False, 1)
         observe(p, s, shaft.y if heard else 0.0, 0.0, 0.0, heard, 1)
+        if p["every"] > 1 and not heard:
+            between(p, s)
         latched(p, s, u, True)
         ask(p, s, 10.0, 0.0, 0.0, 1e9)
         u = float(s["u"][1]) if commands is None else commands[k]
@@ -176,6 +179,101 @@ def test_a_disturbance_that_changes_as_a_gap_begins_is_made_up_for() -> None:
     seen = drive(law(inner)[0], Shaft(inner, -431.7), 60, commands, change=(30, 200.0), lost=(31, 32, 33))
     assert seen.w_hat[34:36] == pytest.approx(seen.w[34:36], abs=0.6)
     assert seen.d_hat[30 + D_TICKS :] == pytest.approx(200.0, rel=1e-7)
+
+
+SELDOM = [
+    (None, 2, 12),
+    (None, 5, 20),
+    (None, 10, 12),
+    (SpeedFilter((300.0,)), 4, 20),
+    (ODRIVE, 2, 12),
+    (ODRIVE, 10, 40),
+    (VESC, 7, 30),
+    (SpeedFilter(ticks=4), 2, 12),
+    (SpeedFilter(ticks=4), 10, 24),
+    (SpeedFilter(ticks=9), 4, 20),
+]
+
+
+@pytest.mark.parametrize(("given", "every", "D"), SELDOM)
+@pytest.mark.parametrize("past", [0, 1, -1])
+def test_speed_and_disturbance_of_measurements_in_each_mth_tick(
+    given: SpeedFilter | None, every: int, D: int, past: int
+) -> None:
+    """Exact in ticks: just after a measurement the gap that is not whole adds what is left of it."""
+    inner = dataclasses.replace(untold(ODRIVE), filter=given, every=every)
+    p = law(inner, dataclasses.replace(FTDOB, delay=D * T_S))
+    shaft = Shaft(dataclasses.replace(inner, filter=given or SpeedFilter((1e9,))), -431.7)
+    start, length = 20 * every + past, 60 * every
+    commands = np.random.default_rng(every).uniform(-5.0, 5.0, length)
+    seen = drive(p[0], shaft, length, commands, change=(start, 200.0))
+    before = slice(10 * every, start)
+    assert seen.d_hat[before] == pytest.approx(-431.7, rel=1e-6)
+    assert seen.w_hat[before] == pytest.approx(seen.w[before], abs=1e-5), "between measurements too"
+    known = start + exact_after(p)[0]
+    assert seen.d_hat[known:] == pytest.approx(200.0, rel=1e-6)
+    assert seen.w_hat[known:] == pytest.approx(seen.w[known:], abs=1e-5)
+    if past == 0:  # a change at a measurement is known after D, to the next measurement
+        on_time = start + D + -D % every
+        assert seen.d_hat[on_time:] == pytest.approx(200.0, rel=1e-6)
+        assert abs(seen.d_hat[on_time - 1] - 200.0) > 1e-3
+
+
+@pytest.mark.parametrize("given", [None, ODRIVE, SpeedFilter(ticks=4)])
+def test_a_measurement_that_was_due_and_lost_is_made_up_for(given: SpeedFilter | None) -> None:
+    inner = dataclasses.replace(untold(ODRIVE), filter=given, every=5)
+    p = law(inner, dataclasses.replace(FTDOB, delay=0.02))
+    shaft = Shaft(dataclasses.replace(inner, filter=given or SpeedFilter((1e9,))), -431.7)
+    commands = np.random.default_rng(7).uniform(-5.0, 5.0, 100)
+    seen = drive(p[0], shaft, 100, commands, lost=(40, 50, 55))
+    assert seen.d_hat[30:] == pytest.approx(-431.7, rel=1e-6)
+    assert seen.w_hat[30:] == pytest.approx(seen.w[30:], abs=1e-5)
+
+
+def test_a_measurement_between_its_times_begins_anew_where_a_filter_is_known() -> None:
+    inner = dataclasses.replace(untold(ODRIVE), every=2)
+    p, s = law(inner, dataclasses.replace(FTDOB, delay=0.02))[0], new_law_state()[0]
+    for fresh in (True, False, True, False, True, True):
+        flowed(p, s, 0.0, False, 1)
+        observe(p, s, 1.0, 0.0, 0.0, fresh, 1)
+    assert s["heard"] == 1
+
+
+def test_the_loop_is_judged_at_the_rate_of_its_measurements() -> None:
+    loops = []
+    for every in (1, 2, 5):
+        inner = dataclasses.replace(untold(ODRIVE), filter=None, every=every)
+        p = law(inner, dataclasses.replace(FTDOB, delay=0.02))
+        loops.append(loop_of(p, shaft_of(MOTOR, inner, None, T_S), T_S))
+    assert all(loop.stable for loop in loops)
+    assert loops[0].ms < loops[1].ms < loops[2].ms
+    assert loops[0].margins.phase_deg > loops[1].margins.phase_deg > loops[2].margins.phase_deg
+
+
+@pytest.mark.parametrize(
+    ("given", "every", "window", "said"),
+    [
+        (None, 13, FTDOB, "measurements come every 13 ms .feedback.period_ms., no one in the window"),
+        (
+            ODRIVE,
+            5,
+            FTDOB,
+            "the states of drive.speed_filter take 10 ms of it, and at least one must be left",
+        ),
+        (ODRIVE, 12, dataclasses.replace(FTDOB, delay=0.1), "takes 36 ticks of measurements in each 12th"),
+        (
+            None,
+            2,
+            ChannelSpec("adaptive", more={"delay_ms": 40.0}),
+            "its thresholds are those of a speed in each tick",
+        ),
+    ],
+)
+def test_measurements_too_seldom_for_the_observer_are_refused(
+    given: SpeedFilter | None, every: int, window: ChannelSpec, said: str
+) -> None:
+    with pytest.raises(ControlDesignError, match=said):
+        law(dataclasses.replace(untold(ODRIVE), filter=given, every=every), window)
 
 
 def test_a_gap_before_there_are_samples_enough_begins_anew() -> None:
@@ -252,7 +350,13 @@ def test_without_a_filter_every_parameter_is_neutral() -> None:
         assert not p[name].any() and LAW_NEUTRAL[name] == 0.0
 
 
-@pytest.mark.parametrize(("name", "value"), [("order", 33), ("order", -1), ("v_y", 0.0), ("gap_y", 0.0)])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("order", 33), ("order", -1), ("v_y", 0.0), ("gap_y", 0.0),
+        ("every", 65), ("every", -1), ("span", 35), ("span", -1),
+    ],
+)  # fmt: skip
 def test_a_log_whose_filter_leads_out_of_the_arrays_is_refused(name: str, value: float) -> None:
     p = law(untold(ODRIVE))
     check_ranges("law", p)

@@ -140,6 +140,12 @@ def test_staleness_counts_periods_and_fresh_feedback_ends_it() -> None:
     assert [ask(judge_timing, guard) for _ in range(6)] == [0] * 5 + [Reason.STALE_FEEDBACK]
 
 
+def test_the_hold_time_begins_when_feedback_is_due() -> None:
+    guard = bench(hold_ticks=2, scheduled=4)
+    guard.t["rx_flags"] = 0
+    assert [ask(judge_timing, guard) for _ in range(7)] == [0] * 6 + [Reason.STALE_FEEDBACK]
+
+
 def test_a_gap_longer_than_allowed() -> None:
     guard = bench(max_gap=3)
     for gap, reason in ((3, Reason.NONE), (4, Reason.LOOP_OVERRUN)):
@@ -162,6 +168,25 @@ def test_an_echo_is_right_within_its_lag() -> None:
     assert echo(guard, 0, 15) == (0, 0), "the counter came round"
     assert echo(guard, 15, 15) == (0, 1), "the same echo again"
     assert echo(guard, 1, 2) == (0, 2), "ahead of the command"
+
+
+def test_an_echo_that_is_wrong_is_held_for_from_when_feedback_is_due() -> None:
+    guard = bench(hold_ticks=2, scheduled=4)
+    guard.s["elapsed"] = 5
+    assert [echo(guard, 5, 1) for _ in range(3)] == [(0, 1), (0, 6), (Reason.COMMAND_LOST, 11)]
+
+
+@pytest.mark.parametrize(("scheduled", "right"), [(15, True), (31, True), (14, False), (0, False)])
+def test_an_echo_may_stand_still_where_the_counter_comes_round(scheduled: int, right: bool) -> None:
+    guard = bench(hold_ticks=2, scheduled=scheduled, counter_modulus=16)
+    assert echo(guard, 3, 3) == (0, 0)
+    assert echo(guard, 3, 3) == (0, 0 if right else 1)
+
+
+def test_an_echo_may_not_stand_still_because_each_counter_has_one_number() -> None:
+    guard = bench(hold_ticks=2, counter_modulus=1)
+    guard.s["echo"] = 0
+    assert echo(guard, 0, 0) == (0, 1)
 
 
 def test_echoes_are_judged_when_fresh_and_not_in_a_shadow_run() -> None:
@@ -353,6 +378,17 @@ def test_the_handshake_by_the_drives_state(
     assert shake(drive, armed=5) == (word, state, run_ticks)
 
 
+@pytest.mark.parametrize("armed", [4, 5])
+def test_a_fault_is_reset_by_words_that_alternate_from_feedback_to_feedback(armed: int) -> None:
+    guard = bench(scheduled=1)
+    guard.t["rx_flags"], guard.t["drive_state"] = FRESH, int(DriveState.FAULT)
+    guard.s["armed_ticks"], words = armed, []
+    for _ in range(3):
+        guard.s["word"] = ask(handshake, guard)
+        words.append(int(guard.s["word"][0]))
+    assert words == [Controlword.FAULT_RESET, Controlword.DISABLE_VOLTAGE, Controlword.FAULT_RESET]
+
+
 @pytest.mark.parametrize(
     ("drive", "word"),
     [
@@ -467,6 +503,19 @@ def test_a_stop_ends_once_the_drive_has_left_operation(state: DriveState, end: D
 @pytest.mark.parametrize(("state", "end"), STOPPED)
 def test_a_drive_that_does_not_leave_is_waited_for_so_long(state: DriveState, end: DriveState) -> None:
     assert ticks_to_end(stop_of(state, ON, quick_stop_ticks=4)) == (STOP_TICKS + 4, end) == (24, end)
+
+
+def test_a_stop_waits_for_feedback_that_is_not_due_yet() -> None:
+    state, lost = DriveState.QUICK_STOP_ACTIVE, int(RxFlag.STATUS)
+    for flags, first_fault in ((FRESH, None), (lost, 8)):
+        guard = stop_of(state, ON, flags, quick_stop_ticks=4, scheduled=3)
+        states = []
+        for _ in range(STOP_TICKS + 4 + 3 - 1):
+            assert ask(stopping, guard) == Controlword.QUICK_STOP
+            states.append(int(guard.s["state"][0]))
+        assert ask(stopping, guard) == Controlword.DISABLE_VOLTAGE
+        faults = [k for k, one in enumerate(states, 1) if one == DriveState.FAULT_REACTION_ACTIVE]
+        assert (faults[0] if faults else None) == first_fault
 
 
 def test_feedback_that_is_lost_for_too_long_makes_a_quick_stop_a_fault() -> None:
