@@ -27,9 +27,8 @@ def seen_in(step: Step, ticks: TickArray) -> Seen:
     if len(own) < 10:
         return Seen(("the drive was not enabled long enough to see anything",))
     limited = float(np.mean(own["limited"] != 0))
-    more = (
-        (f"the drive limited the voltage in {100 * limited:.0f} % of the ticks: left out",) if limited else ()
-    )
+    text = f"the drive was at its limit, of supply or current, in {100 * limited:.0f} % of the ticks"
+    more = (f"{text}: left out",) if limited else ()
     pulses = _pulses if step.controller.get("passes") else _currents
     judged = {"sensors": _rest, "standstill": pulses, "spinning": _turns, "inertia": _turns}[step.name](
         step, own

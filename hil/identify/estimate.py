@@ -205,7 +205,8 @@ def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
         if place in (B_F, COULOMB, LOAD):  # 0 is a value like any other
             told = bool(found.told[place] > 0.5)
             told &= half * (fastest if place == B_F else 1.0) <= max(TOLD * abs(value), 0.1 * friction)
-        out.put(name, value, half, "" if told else f"not told by this excitation: it takes {EXCITES[name]}")
+        why = falling(name, value, half, fastest) if told else _why(name)
+        out.put(name, value, half, why)
     psi, k = out.parameters["psi_f"], 1.5 * guess.n_p
     out.put("k_t", k * psi.value, k * psi.half, psi.why)
     if psi.told and psi.value < 0:
@@ -219,6 +220,17 @@ def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
     load = out.parameters["load"]
     if load.told and abs(load.value) > load.half + 0.05 * abs(out.parameters["coulomb"].value):
         out.findings.append(f"a load of {load.value:.3g} N m acts on the shaft all the time")
+
+
+def _why(name: str) -> str:
+    return f"not told by this excitation: it takes {EXCITES[name]}"
+
+
+def falling(name: str, value: float, half: float, fastest: float) -> str:
+    """Why B_f is not told where friction falls with speed, as by Stribeck near rest; empty otherwise."""
+    if name != "B_f" or value + half >= 0.0:
+        return ""
+    return f"friction falls with speed up to {fastest:.3g} rad/s: it takes a faster run-down"
 
 
 def _note_noise(out: Estimate, samples: Samples) -> None:

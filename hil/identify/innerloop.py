@@ -20,7 +20,17 @@ from hil.control.registry import SpeedFilter
 from hil.control.speed import MOST_DELAY
 from hil.identify import estimate as of_voltages
 from hil.identify.data import SHORTEST, Samples, joined, turning
-from hil.identify.estimate import BROKEN, EXACT, TOLD, UNITS, Estimate, Parameter, excited, thinned
+from hil.identify.estimate import (
+    BROKEN,
+    EXACT,
+    TOLD,
+    UNITS,
+    Estimate,
+    Parameter,
+    excited,
+    falling,
+    thinned,
+)
 from hil.identify.inner import TAU, B, C, Drive, G, InnerFit, L, at_delay, best_delay, fit, residual_of
 from hil.identify.model import Flags
 from hil.identify.shaft import calm, rough, times
@@ -62,7 +72,7 @@ def estimate(runs: Sequence[TickArray], config: RunConfig, motor: MotorTable) ->
     samples = thinned(excited(everything.with_free(turning(everything))))
     if not drive.told:
         samples = samples.segments(samples.free[samples.begins]) if len(samples) else samples
-    if len(samples) < 50:
+    if len(samples) < 50 or not samples.u.any():
         _at_rest(out, everything, drive)
         return out
     found, delay = _fitted(out, samples, drive, guess, config)
@@ -165,7 +175,7 @@ def _note(out: Estimate, found: InnerFit, k_t: float) -> None:
         half = math.hypot(J * float(found.half[place]), share * torque)
         both = name != "load" or len(set(np.sign(out.samples.y[out.samples.free, 0]))) > 1
         told = slides and both and half * scale <= max(TOLD * abs(torque) * scale, 0.1 * friction)
-        out.put(name, torque, half, "" if told else _why(name))
+        out.put(name, torque, half, falling(name, torque, half, fastest) if told else _why(name))
     load = out.parameters["load"]
     if load.told and abs(load.value) > load.half + 0.05 * abs(out.parameters["coulomb"].value):
         out.findings.append(f"a load of {load.value:.3g} N m acts on the shaft all the time")
@@ -199,15 +209,17 @@ def _note_noise(out: Estimate, found: InnerFit, samples: Samples, drive: Drive) 
 
 
 def _at_rest(out: Estimate, samples: Samples, drive: Drive) -> None:
-    """Of a drive in which nothing happens the noise alone can be told, and whether something turns it."""
-    spread, mean = np.std(samples.y, axis=0), np.mean(samples.y, axis=0)
+    """Of a drive that is asked for nothing the noise alone can be told, and whether something turns it."""
+    trend = [np.polyval(np.polyfit(samples.t, column, 2), samples.t) for column in samples.y.T]
+    spread = np.std(samples.y - np.array(trend).T, axis=0)
     names = ("w_noise", "i_q_noise") if drive.told else ("w_noise",)
     for name, value in zip(names, spread, strict=False):
         out.put(name, float(value), 1.96 * float(value) / math.sqrt(2 * len(samples)))
     for name, how in EXCITES.items():
         out.parameters[name] = Parameter(math.nan, math.nan, math.nan, UNITS[name], False, f"it takes {how}")
-    if abs(mean[0]) > 6.0 * spread[0]:
-        out.findings.append(f"the shaft turns at {mean[0]:.3g} rad/s without current: a load drives it")
+    fastest = float(trend[0][np.argmax(np.abs(trend[0]))])
+    if abs(fastest) > 6.0 * spread[0]:
+        out.findings.append(f"the shaft turns at {fastest:.3g} rad/s without current: a load drives it")
 
 
 def _compare(out: Estimate, config: RunConfig) -> None:

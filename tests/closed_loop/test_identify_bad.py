@@ -1,0 +1,90 @@
+"""What may be wrong around a motor, in simulation: each named in a line, or ridden through without a lie."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hil.config.tables import RunConfig, load_toml
+from hil.identify.session import Session, planned, setup_for
+from hil.sim.simulate import simulate_ticks
+from tests.conftest import CONFIGS
+
+pytestmark = pytest.mark.compiled
+BLOCKED = 'load=[{kind="brake",torque_n_m=100.0}]'
+DRIVEN = 'load=[{kind="constant",torque_n_m=1.5}]'
+HANGS = 'load=[{kind="constant",torque_n_m=0.15}]'
+NO_LOAD = "load=[]"
+WEAK = 'firmware={takes="current",i_limit_a=1.0}'
+LOW = "inverter={v_dc_v=60.0}"
+FEW_VOLTS = ("limits.v_dc_min_v=20.0",)
+
+
+def seen(name: str, steps: tuple[str, ...], *plant: str, own: tuple[str, ...] = ()) -> Session:
+    """The session of a shipped drive, its plant changed, until a fault."""
+    path = CONFIGS / f"{name}.toml"
+    config = load_toml(path, RunConfig, own)
+    session = Session(path, config, config.motor)
+    for step in planned(session, steps):
+        session.note(step, simulate_ticks(setup_for(session, step), list(plant)))
+        if session.faults:
+            break
+    return session
+
+
+@pytest.mark.parametrize(
+    ("steps", "plant", "words"),
+    [
+        (("spinning",), (BLOCKED,), "does not turn with 7.5 A"),
+        (("spinning",), (DRIVEN,), "turns against the torque"),
+        (("standstill",), (NO_LOAD, WEAK), "of 3.18 A that were asked for 1 A came"),
+    ],
+)
+def test_a_drive_with_a_current_loop_names_it_too(
+    steps: tuple[str, ...], plant: tuple[str, ...], words: str
+) -> None:
+    session = seen("current", steps, *plant)
+    assert len(session.faults) == 1 and words in session.faults[0]
+    assert session.as_dict()["ok"] is False
+
+
+@pytest.mark.parametrize("name", ["demo", "current"])
+def test_a_load_that_drives_the_shaft_at_rest_is_named(name: str) -> None:
+    """Without torque it comes to 100 rad/s: no run of that may break the estimate."""
+    session = seen(name, ("sensors",), DRIVEN)
+    assert session.faults == []
+    assert any("without torque: a load drives it" in line for line in session.findings)
+    assert not session.estimate.parameters["J"].told
+
+
+def test_noise_of_a_driven_shaft_is_not_its_motion() -> None:
+    p = seen("current", ("sensors",), DRIVEN).estimate.parameters["w_noise"]
+    assert p.told and p.value == pytest.approx(math.hypot(0.01, 0.01 / math.sqrt(12)), rel=0.15)
+
+
+def test_a_load_that_acts_all_the_time_is_a_parameter() -> None:
+    session = seen("current", ("inertia",), HANGS)
+    p: Any = session.estimate.parameters["load"]
+    assert p.told and p.low <= 0.15 * 3.6 / (1.5 * 3 * 0.76) <= p.high
+    assert any("acts on the shaft all the time" in line for line in session.estimate.findings)
+
+
+def test_a_supply_that_limits_is_ridden_through_with_wider_intervals() -> None:
+    """60 V of 540 V: most ticks are limited and left out; the rest tells the motor, and B_f is refused."""
+    session = seen("demo", ("standstill", "inertia"), NO_LOAD, LOW, own=FEW_VOLTS)
+    full = seen("demo", ("standstill", "inertia"), NO_LOAD)
+    assert session.faults == []
+    assert any("at its limit, of supply or current, in 8" in line for line in session.findings)
+    found = session.estimate.parameters
+    true = {"R_s": 3.45, "L_d": 0.0297, "L_q": 0.0297, "psi_f": 0.76, "J": 0.01265}
+    for key, value in true.items():
+        p = found[key]
+        assert p.told and p.low <= value <= p.high, key
+        assert p.value == pytest.approx(value, rel=0.02), key
+    wider = [found[key].half / full.estimate.parameters[key].half for key in ("J", "coulomb", "R_s")]
+    assert min(wider) > 1.0 and np.isfinite(wider).all()
+    b_f = found["B_f"]
+    assert not b_f.told and "friction falls with speed" in b_f.why and session.motor.B_f_n_m_s == 2e-4
