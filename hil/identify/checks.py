@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,11 @@ from hil.identify.estimate import UNITS, Parameter
 from hil.identify.plan import Step
 from hil.report.metrics import operating
 from hil.signals import TickArray
+
+SETTLED: Final = 5
+"""Ticks in which a drive's current comes to what is asked for."""
+QUIET: Final = 20
+"""Ticks at the start of a step without much current."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +90,9 @@ def _fast(own: TickArray) -> float:
 
 
 def _turns(step: Step, own: TickArray) -> Seen:
-    """The shaft must turn, and first the way of the torque."""
+    """The shaft must turn, and first the way of the torque, by no other current than is asked for."""
+    if astray := _astray(own):
+        return Seen((astray,))
     peak, current = float(np.abs(own["w"]).max()), float(np.abs(_flowed(own)).max())
     first_way = float(np.sign(step.controller["q"][0]))
     wrong = step.controller["w_wrong_rad_s"]
@@ -96,6 +104,25 @@ def _turns(step: Step, own: TickArray) -> Seen:
         text = f"the shaft does not turn with {current:.3g} A: it is blocked, or its load needs more than"
         return Seen((f"{text} limits.i_max_a allows",))
     return Seen()
+
+
+def _astray(own: TickArray) -> str:
+    """Where current flows that nobody asked for while what is asked for stands: i_d, or i_q off what was."""
+    asked, told = own["i_q_ref"], np.isfinite(own["i_d"])
+    stands = np.abs(asked - np.roll(asked, SETTLED)) < 0.02 * float(np.abs(asked).max())
+    stands[:SETTLED] = False
+    rows = stands & (own["limited"] == 0) & np.isfinite(_flowed(own))
+    off = np.where(told, own["i_d"], _flowed(own) - asked)
+    if int(rows.sum()) < 50:
+        return ""
+    size, along = (float(np.sqrt(np.mean(column[rows] ** 2))) for column in (off, _flowed(own)))
+    if size < max(0.25 * along, 6.0 * float(np.std(off[:QUIET]))):
+        return ""
+    name = "i_d" if told[rows].all() else "i_q"
+    return (
+        f"{name} is {size:.3g} A off what is asked for, with {along:.3g} A of i_q: an open phase, "
+        "or the rotor angle is off"
+    )
 
 
 def _flowed(own: TickArray) -> npt.NDArray[np.float64]:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from hil.config.tables import RunConfig, load_toml
+from hil.identify.checks import seen_in
 from hil.identify.fromlogs import from_logs
 from hil.identify.plan import STEPS, Step, make
 from hil.log.reader import Frame, open_log
@@ -60,13 +61,13 @@ WIRES = {
 }  # fmt: skip
 
 
-def identified(configs: Path, name: str, steps: str) -> tuple[dict[str, Any], str]:
-    """The result and the messages of a lockstep run with its emulator."""
+def identified(configs: Path, name: str, steps: str, code: int = 0) -> tuple[dict[str, Any], str]:
+    """The result and the messages of a lockstep run with its emulator, that ends with this code."""
     command = [sys.executable, "-m", "hil.cli", "identify", str(configs / f"{name}.toml"), "--emulated"]
     command += ["--lockstep", "--json", "--steps", steps, "-o", str(configs.parent / "motor.toml")]
     command += ["--set", f'log.folder="{configs.parent / "logs"}"']
     out = subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=ROOT, check=False)
-    assert out.returncode == 0, out.stderr
+    assert out.returncode == code, out.stderr
     return json.loads(out.stdout), out.stderr
 
 
@@ -121,6 +122,25 @@ def test_a_drive_with_a_loop_of_its_own_over_the_bus(configs: Path, name: str, s
     again, *_ = from_logs(logs)
     for key, row in again["parameters"].items():
         assert row["value"] == pytest.approx(p[key.lower()]["value"], rel=0.02, abs=1e-4), key
+
+
+def test_an_open_phase_behind_a_current_loop_is_named_by_the_current_that_nobody_asked_for(
+    configs: Path,
+) -> None:
+    """Seen by i_d; of a drive that reports none by what i_q is off."""
+    plant = configs / "plants" / "current.toml"
+    kept = plant.read_text(encoding="utf-8").partition("[[load]]")[0]
+    plant.write_text(f'{kept}\n[[fault]]\nkind = "phase-loss"\nat_s = 0.0\n', encoding="utf-8")
+    result, said = identified(configs, "current", "spinning", code=1)
+    assert len(result["faults"]) == 1 and result["file"] is None, said
+    assert result["faults"][0].startswith("i_d is 0.") and "an open phase" in result["faults"][0]
+    config = load_toml(configs / "current.toml", RunConfig)
+    step = make("spinning", config, config.motor)
+    ticks = open_log(Path(result["logs"][0]), frames=False).ticks
+    ticks["i_d"] = math.nan
+    assert isinstance(step, Step)
+    (fault,) = seen_in(step, ticks).faults
+    assert fault.startswith("i_q is 0.") and "an open phase" in fault
 
 
 def test_the_whole_run_takes_under_a_minute_of_the_motor() -> None:
