@@ -47,11 +47,11 @@ def bus_load(frames: Iterable[tuple[float, float]]) -> float:
     return sum(seconds * rate for seconds, rate in frames)
 
 
-def message_rates(binding: Binding, rate_hz: float) -> list[tuple[Message, float]]:
+def message_rates(binding: Binding, rate_hz: float, every: int = 1) -> list[tuple[Message, float]]:
     """How often each message of the map is on the bus [1/s], the loop running at ``rate_hz``.
 
-    SYNC, commands and measurements once a tick; others by the DBC's cycle time, which for a drive that
-    takes SYNC counts in SYNCs; heartbeats by their cycle time alone. Without a cycle time: not counted.
+    SYNC and commands once a tick, measurements in each ``every``-th; others by the DBC's cycle time, which
+    for a drive that takes SYNC counts in SYNCs; heartbeats by their cycle time alone. Without: not counted.
     """
     sync, beat = binding.sync, binding.heartbeat
     stretch = rate_hz * sync.cycle_ms / 1000.0 if sync and sync.cycle_ms else 1.0
@@ -59,7 +59,7 @@ def message_rates(binding: Binding, rate_hz: float) -> list[tuple[Message, float
     rates += [(sync, rate_hz)] if sync else []
     for bound in binding.incoming:
         if any(part in MEASURED for part, _ in bound.parts):
-            rates.append((bound.message, rate_hz))
+            rates.append((bound.message, rate_hz / every))
         elif bound.message.cycle_ms:
             rates.append((bound.message, 1000.0 / bound.message.cycle_ms * stretch))
     return rates + ([(beat, 1000.0 / beat.cycle_ms)] if beat and beat.cycle_ms else [])

@@ -20,6 +20,7 @@ from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.check.filtered import filter_rows
 from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
+from hil.check.seldom import seldom_rows
 from hil.config.tables import BusTable, LimitsTable
 from hil.control.law import CASCADE, PI
 from hil.errors import ConfigError, HilError, plain
@@ -52,6 +53,7 @@ def check(setup: Setup) -> list[Row]:
         *bus_rows(setup),
         *reach_rows(setup),
         *speed_filter_rows(setup),
+        *seldom_rows(setup),
         load_row(setup),
         *adaptive_rows(setup),
         *heard_rows(setup),
@@ -269,9 +271,11 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
 
 def feedback_rows(setup: Setup, traffic: Traffic, silent_ok: bool) -> list[Row]:
     """One row for each message with measurements."""
-    rate_hz, parts = setup.config.loop.rate_hz, setup.binding.incoming
+    config, parts = setup.config, setup.binding.incoming
+    rate_hz, every = config.loop.rate_hz / config.feedback_every, config.feedback_every
+    what = "loop" if every == 1 else "feedback.period_ms"
     names = [b.message.name for b in parts if any(part in MEASURED for part, _ in b.parts)]
-    rows = [feedback_row(traffic.of(name), rate_hz, silent_ok) for name in names]
+    rows = [feedback_row(traffic.of(name), rate_hz, silent_ok, what) for name in names]
     if len(rows) == 1:
         return rows
     return [replace(r, check=f"{r.check} {name}") for name, r in zip(names, rows, strict=True)]
@@ -290,15 +294,15 @@ def drive_row(traffic: Traffic, binding: Binding, seconds: float, asked: bool = 
     return row("drive", bool(names), found, remedy)
 
 
-def feedback_row(feedback: Heard, rate_hz: int, silent_ok: bool) -> Row:
-    """Does feedback come at the rate of the loop."""
+def feedback_row(feedback: Heard, rate_hz: float, silent_ok: bool, what: str = "loop") -> Row:
+    """Does feedback come at the rate of the loop, or at that of feedback.period_ms."""
     if feedback.count == 0:
         if silent_ok:
             return Row("feedback rate", "warn", "no feedback: it comes with SYNC only", SILENT)
         return Row("feedback rate", "fail", "no feedback", "switch on the drive's cyclic transmission")
     near = abs(feedback.rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE
-    found = f"{feedback.rate_hz:.0f} Hz, loop {rate_hz} Hz"
-    return row("feedback rate", near, found, "set loop.rate_hz or the drive's cycle time")
+    found = f"{feedback.rate_hz:.0f} Hz, {what} {rate_hz:g} Hz"
+    return row("feedback rate", near, found, "set loop.rate_hz, the drive's cycle time or feedback.period_ms")
 
 
 def frames_row(traffic: Traffic) -> Row:

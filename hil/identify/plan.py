@@ -241,6 +241,11 @@ def config_of(config: RunConfig, step: Step, motor: MotorTable, log_name: str) -
     following_error_rad_s, and where i_d is driven i_d_max_a and open_phase_min_a. All other limits stay.
     """
     own_loop = config.drive.takes != "voltage"
+    if config.feedback_every > 1:
+        raise HilError(
+            "feedback.period_ms: hil identify needs a measurement in each tick; lower loop.rate_hz to their "
+            "rate for it (--set), or let the drive send more often"
+        )
     turns = step.controller.get("passes", 0.0) == 0.0
     w_run = top_speed(config, motor) if turns else 1e-3
     adapter: Any = TypeAdapter(ControllerTable)

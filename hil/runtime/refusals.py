@@ -48,7 +48,7 @@ def check_reachable(setup: Setup) -> None:
 def load_found(setup: Setup) -> tuple[str, bool]:
     """Worst-case bus load of this run in words, with the frames that make it, and whether it is allowed."""
     bus = setup.config.bus
-    rates = message_rates(setup.binding, float(setup.config.loop.rate_hz))
+    rates = message_rates(setup.binding, float(setup.config.loop.rate_hz), setup.config.feedback_every)
     shares = message_shares(rates, bus.bitrate, bus.data_bitrate)
     load = sum(shares.values())
     frames = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())

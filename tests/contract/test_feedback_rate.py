@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from drivers.busload import message_rates
+from drivers.listen import Heard
 from firmware_model.config import PlantConfig
+from hil.check.checks import feedback_row
+from hil.check.seldom import seldom_rows
 from hil.config.tables import load_toml
 from hil.control.errors import ControlDesignError
 from hil.errors import ConfigError, HilError
+from hil.identify.plan import Skipped, config_of, make
+from hil.log.reader import open_log
 from hil.replay import replay
 from hil.runtime.loop import SINCE, is_due, new_pace
+from hil.runtime.session import run
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Reason, RxFlag
-from hil.sim.demo import emulator_process, own_channel
+from hil.sim.demo import emulator_process, own_channel, set_up
 from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
@@ -40,12 +49,6 @@ def asked(*settings: str, folder: Path | None = None, ms: float = 5.0, D: float 
 
 def in_lockstep(path: Path, overrides: Overrides, plant: tuple[str, ...]) -> tuple[Any, Path]:
     """Ticks and log of a run against the emulator's process."""
-    from dataclasses import replace
-
-    from hil.log.reader import open_log
-    from hil.runtime.session import run
-    from hil.sim.demo import set_up
-
     overrides = replace(overrides, channel=own_channel("seldom"))
     setup = load_setup(path, overrides)
     with emulator_process(path, overrides, plant):
@@ -157,7 +160,47 @@ def test_a_rate_that_can_not_be_is_one_line(path: Path, settings: tuple[str, ...
     assert "\n" not in str(told.value)
 
 
-def test_each_tick_may_be_said(tmp_path: Path) -> None:
+def test_the_check_says_what_seldom_measurements_cost() -> None:
+    (row,) = seldom_rows(load_setup(ODRIVE, asked()))
+    assert row.verdict == "pass" and re.match(
+        r"measured every 5 ms, in each 5th tick: D = 20 ms is 4 of them; a load step is seen 2 ms later on "
+        r"average, and known after 24 ms; Ms [\d.]+ \([\d.]+ in each tick\), phase \d+ deg \(\d+\)",
+        row.found,
+    )
+    ms = [float(one) for one in re.findall(r"Ms ([\d.]+) \(([\d.]+) ", row.found)[0]]
+    assert ms[0] > ms[1] > 1.0
+    assert seldom_rows(load_setup(ODRIVE, Overrides())) == []
+    (near,) = seldom_rows(load_setup(CURRENT, asked("controller.speed_pole_rad_s=300.0", ms=10.0, D=12.0)))
+    assert near.verdict == "warn" and "let the drive send more often" in near.remedy
+
+
+def test_the_load_and_the_rate_of_the_bus_are_those_of_seldom_measurements() -> None:
+    setup = load_setup(ODRIVE, asked())
+    rates = {m.name: rate for m, rate in message_rates(setup.binding, 1000.0, setup.config.feedback_every)}
+    assert (rates["Get_Encoder_Estimates"], rates["Set_Input_Torque"]) == (200.0, 1000.0)
+    heard = Heard(count=101, first_ns=1, last_ns=500_000_001)
+    assert feedback_row(heard, 200.0, False, "feedback.period_ms").verdict == "pass"
+    wrong = feedback_row(heard, 1000.0, False)
+    assert (wrong.verdict, wrong.found) == ("fail", "200 Hz, loop 1000 Hz") and "period_ms" in wrong.remedy
+
+
+def test_a_loop_that_is_not_stable_at_their_rate_is_refused() -> None:
+    slow = 'drive.speed_filter={kind = "first-order", pole_rad_s = 50.0, modelled = false}'
+    said = "feedback.period_ms: the loop is not stable through a first-order filter of 50 rad/s, measured in"
+    with pytest.raises(ConfigError, match=said) as told:
+        load_setup(CURRENT, Overrides(settings=("feedback.period_ms=10", slow)))
+    assert "let the drive send more often" in str(told.value)
+
+
+def test_identify_needs_a_measurement_in_each_tick() -> None:
+    config = load_setup(ODRIVE, asked()).config
+    step = make("spinning", config, config.motor)
+    assert not isinstance(step, Skipped)
+    with pytest.raises(HilError, match="hil identify needs a measurement in each tick"):
+        config_of(config, step, config.motor, "step")
+
+
+def test_each_tick_may_be_said() -> None:
     for path in (ODRIVE, CONFIGS / "demo.toml"):
         assert load_setup(path, Overrides(settings=("feedback.period_ms=1",))).config.feedback_every == 1
 
