@@ -34,7 +34,9 @@ def register(commands: Commands) -> None:
     )
     command.add_argument("config", type=Path, metavar="CONFIG", nargs="?", help="run configuration (TOML)")
     command.add_argument("--emulated", action="store_true", help="start the emulated drive of CONFIG, too")
-    command.add_argument("--steps", metavar="A,B", help="of sensors, standstill, spinning, inertia (all)")
+    command.add_argument(
+        "--steps", metavar="A,B", help="of sensors, standstill, spinning, inertia (all); cogging by itself"
+    )
     command.add_argument(
         "--from",
         dest="logs",
@@ -55,12 +57,18 @@ def cmd_identify(args: argparse.Namespace) -> int:
     one_thread()
     from hil.errors import HilError
 
-    if args.logs and (args.config or args.emulated or args.arm or args.steps):
-        raise HilError("--from re-estimates from logs: it takes no CONFIG, --emulated, --steps or --arm")
+    cogging = is_cogging(args.steps)
+    if args.logs and (args.config or args.emulated or args.arm or (args.steps and not cogging)):
+        raise HilError(
+            "--from re-estimates from logs: it takes no CONFIG, --emulated or --arm, of --steps cogging alone"
+        )
     if not args.logs and args.config is None:
         raise HilError("hil identify needs a CONFIG, or logs with --from")
-    file = _output(args)
-    result = _from_logs(args, file) if args.logs else _on_the_bus(args, file)
+    file = _output(args, "-cogging" if cogging else "-motor" if args.logs else "")
+    if cogging:
+        result = _cogging_from_logs(args, file) if args.logs else _on_the_bus(args, file, cogging=True)
+    else:
+        result = _from_logs(args, file) if args.logs else _on_the_bus(args, file)
     if args.json:
         print_json(result)
     else:
@@ -74,12 +82,22 @@ def cmd_identify(args: argparse.Namespace) -> int:
     return 0 if result["ok"] else EXIT_FAILED
 
 
-def _output(args: argparse.Namespace) -> Path:
+def is_cogging(steps: str | None) -> bool:
+    """True for the step that is a run of its own. Raises HilError when others are asked for beside it."""
+    from hil.errors import HilError
+
+    names = [name.strip() for name in (steps or "").split(",") if name.strip()]
+    if "cogging" in names and set(names) != {"cogging"}:
+        raise HilError("--steps: cogging writes a file of its own; run it by itself, after the others")
+    return "cogging" in names
+
+
+def _output(args: argparse.Namespace, end: str) -> Path:
     """Where the motor goes. Raises HilError before anything is done."""
     path = args.output
     if path is None:
-        stem = args.config.stem if args.config else f"{args.logs[0].stem}-motor"
-        path = output_folder(Path("logs/identify")) / f"{stem}.toml"
+        stem = args.config.stem if args.config else args.logs[0].stem
+        path = output_folder(Path("logs/identify")) / f"{stem}{end}.toml"
     return output_file(path, ".toml", config=args.config)
 
 
@@ -100,24 +118,48 @@ def _from_logs(args: argparse.Namespace, file: Path) -> dict[str, Any]:
     return result | {"file": _write(file, text)}
 
 
-def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
+def _cogging_from_logs(args: argparse.Namespace, file: Path) -> dict[str, Any]:
+    from hil.identify.coggingrun import from_logs
+
+    result, config = from_logs(args.logs)
+    return _written(result, config, file)
+
+
+def _written(result: dict[str, Any], config: RunConfig, file: Path) -> dict[str, Any]:
+    """Write file and picture of what was learned, if there is anything."""
+    from hil.identify.coggingrun import picture, table_of, toml_of
+
+    found = result.pop("found")
+    table = table_of(found, config, result["logs"]) if result["ok"] else None
+    if table is None:
+        return result | {"file": None, "picture": None}
+    drawn = file.with_suffix(".png")
+    drawn.write_bytes(picture(found))
+    return result | {"file": _write(file, toml_of(table)), "picture": str(drawn)}
+
+
+def _on_the_bus(args: argparse.Namespace, file: Path, cogging: bool = False) -> dict[str, Any]:
     """The experiments, with the emulator of the configuration where that is asked for."""
     with lean_imports():
         from hil.runtime.bus import is_emulated_bus
         from hil.runtime.refusals import check_arming
         from hil.runtime.setup import load_setup
     from hil.errors import HilError
+    from hil.identify.coggingrun import on_the_bus, ready
     from hil.identify.plan import chosen
     from hil.identify.session import checked, identify, motor_toml
     from hil.runtime.arming import confirm
 
-    names, given = chosen(args.steps), overrides(args)
+    names, given = () if cogging else chosen(args.steps), overrides(args)
     if args.emulated and given.channel is None:
         from hil.sim.demo import own_channel
 
         given = replace(given, channel=own_channel("identify"))
     setup = load_setup(args.config, given)
-    checked(args.config, setup.config)
+    if cogging:
+        ready(args.config, setup)
+    else:
+        checked(args.config, setup.config)
     emulated = is_emulated_bus(setup.config)
     if args.emulated and not emulated:
         raise HilError("--emulated: the bus may carry a real drive; take -i hil-local, or leave it out")
@@ -125,6 +167,9 @@ def _on_the_bus(args: argparse.Namespace, file: Path) -> dict[str, Any]:
     if not (args.yes or emulated):
         confirm(setup.config, sys.stdin, sys.stderr)
     with _emulator(args, given, setup.config):
+        if cogging:
+            learned = on_the_bus(args.config, setup.config, say, arm=args.arm)
+            return _written(learned, setup.config, file)
         session = identify(args.config, setup.config, names, say, arm=args.arm)
     text = motor_toml(session) if not session.faults else ""
     return session.as_dict() | {"file": _write(file, text)}

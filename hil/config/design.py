@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from hil.config.setpoint_design import setpoint_params
 from hil.config.tables import LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.control.cogging import Harmonics
 from hil.control.errors import ControlDesignError
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
@@ -151,7 +152,7 @@ def motor_model(table: MotorTable) -> MotorModel:
 
 def _values(table: Any) -> dict[str, Any]:
     """The keys of a law's or an observer's table, without what every one has."""
-    keys: dict[str, Any] = table.model_dump(exclude={"kind", "compensate_coupling"})
+    keys: dict[str, Any] = table.model_dump(exclude={"kind", "compensate_coupling", "anticogging"})
     return keys
 
 
@@ -196,6 +197,36 @@ def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
     return InnerLoop(config.k_t / u_i, u_i, lag, drive.delay_ticks, told, known, every)
 
 
+OTHER_MOTOR = 0.1
+"""Share by which the torque constant of a file's motor may be off, as its identification may be."""
+
+
+def known_cogging(config: RunConfig) -> Harmonics | None:
+    """The load torque over the angle that is to be compensated. Raises ControlDesignError."""
+    given = config.controller.anticogging
+    if given is None:
+        return None
+    motor, where = config.motor, "controller.anticogging"
+    named = given.motor and motor.name and given.motor != motor.name
+    if named or given.n_p != motor.n_p or abs(given.k_t_n_m_a / config.k_t - 1.0) > OTHER_MOTOR:
+        raise ControlDesignError(
+            f"{where}: learned of a motor {given.motor!r} with n_p = {given.n_p}, "
+            f"k_t = {given.k_t_n_m_a:.4g} N m/A; the configuration's is {motor.name!r} with "
+            f"{motor.n_p}, {config.k_t:.4g}; learn it of this one"
+        )
+    most = min(config.k_t * config.limits.i_max_a, config.limits.torque_max_n_m or math.inf)
+    if given.known.peak > most:
+        raise ControlDesignError(
+            f"{where}: its peak is {given.known.peak:.4g} N m, the limits allow {most:.4g} N m "
+            f"(i_max_a, torque_max_n_m); learn it anew, or take it out"
+        )
+    known: Harmonics = given.known
+    inner = inner_loop(config)
+    if inner is not None and inner.every > 1:
+        raise ControlDesignError(f"{where}: needs the angle in each tick; leave it or feedback.period_ms out")
+    return known
+
+
 def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
     """The law's tuning. Raises ControlDesignError only when designed. ``told``: the drive reports i_q."""
     controller, observer = config.controller, config.observer
@@ -209,6 +240,7 @@ def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
         i_max=config.limits.i_max_a,
         T_L_max=config.limits.T_L_max_n_m,
         coupling=controller.compensate_coupling,
+        cogging=known_cogging(config),
         more=_values(controller),
     )
 
@@ -337,6 +369,11 @@ def reference_record(table: ReferenceTable) -> Record:
 def build(config: RunConfig, wire: WireFacts) -> Machine:
     """Design the controller of a run. Raises ControlDesignError."""
     told = not wire.absent & NO_I_Q
+    if config.controller.anticogging is not None and "angle" not in wire.measured:
+        raise ControlDesignError(
+            "controller.anticogging: the drive reports no angle; name it in drive.signals.angle, or leave "
+            "this out"
+        )
     law = design_law(law_spec(config, told), 1.0 / config.loop.rate_hz)
     return Machine(
         safety_params(config, wire),

@@ -32,6 +32,7 @@ from pydantic import (
     model_validator,
 )
 
+from hil.control.cogging import MOST_ORDER, ORDERS, Harmonics
 from hil.control.registry import REQUIRED, Key, laws, observers
 from hil.errors import ConfigError
 
@@ -145,6 +146,55 @@ class MotorTable(Table):
     """Viscous friction B_f: torque over mechanical speed."""
     identified: IdentifiedTable | None = None
     """Where the values come from, when hil identify found them."""
+
+
+class AnticoggingTable(Table):
+    """Load torque over the shaft's angle theta, as hil identify --steps cogging writes it:
+    T_c = sum of cos_n_m cos(n theta) + sin_n_m sin(n theta) over the orders n."""
+
+    date: str = ""
+    """When it was learned, UTC."""
+    drive: str = ""
+    """On which drive and bus."""
+    logs: list[str] = []
+    """The runs that it was learned from."""
+    motor: str = ""
+    """Name of the motor that it is of."""
+    n_p: Annotated[int, Field(ge=1, le=100)]
+    """Pole pairs of the motor that it is of."""
+    k_t_n_m_a: Positive
+    """Torque constant of the motor that it is of, by which currents became torques."""
+    speed_rad_s: Positive | None = None
+    """Speed at which it was learned."""
+    laps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """Whole turns that it was learned from."""
+    residual_n_m: NonNegative | None = None
+    """What no harmonic explained, rms."""
+    orders: Annotated[list[Annotated[int, Field(ge=1, le=MOST_ORDER)]], Field(max_length=ORDERS)] = []
+    """Periods in a turn of the shaft, ascending."""
+    cos_n_m: list[Finite] = []
+    """Cosine coefficient of each order."""
+    sin_n_m: list[Finite] = []
+    """Sine coefficient of each order."""
+    error_n_m: list[NonNegative] = []
+    """Half of the 95 % interval of each order's coefficients."""
+
+    @model_validator(mode="after")
+    def _as_many(self) -> AnticoggingTable:
+        n = len(self.orders)
+        sizes = [len(row) for row in (self.cos_n_m, self.sin_n_m)]
+        if n == 0:
+            raise ValueError("orders: missing; learn it anew, or leave anticogging out")
+        if sizes != [n, n] or len(self.error_n_m) not in (0, n):
+            raise ValueError("orders, cos_n_m, sin_n_m and error_n_m must be of one length; learn it anew")
+        if any(a >= b for a, b in zip(self.orders, self.orders[1:], strict=False)):
+            raise ValueError("orders must ascend; learn it anew")
+        return self
+
+    @property
+    def known(self) -> Harmonics:
+        """As the law takes it."""
+        return Harmonics(tuple(self.orders), tuple(self.cos_n_m), tuple(self.sin_n_m))
 
 
 class LoopTable(Table):
@@ -395,6 +445,9 @@ def _law_kind(value: Any) -> Any:
     return value.get("kind", "cascade") if isinstance(value, Mapping) else getattr(value, "kind", None)
 
 
+ANTICOGGING = (
+    "Load torque over the angle to compensate: a file of hil identify --steps cogging; left out: none."
+)
 COUPLING = "Reluctance torque and cross-coupling are known terms; false: the observers find them."
 if typing.TYPE_CHECKING:
     ChannelTable = Any
@@ -403,7 +456,15 @@ else:
     ChannelTable = _tables(observers(), "Observer", {})
     """One channel's observer: a table of each registered kind (:mod:`hil.control.observers`)."""
     ControllerTable = _tables(
-        laws(), "Controller", {"compensate_coupling": (bool, Field(True, description=COUPLING))}
+        laws(),
+        "Controller",
+        {
+            "compensate_coupling": (bool, Field(True, description=COUPLING)),
+            "anticogging": (
+                Annotated[AnticoggingTable | None, BeforeValidator(included)],
+                Field(None, description=ANTICOGGING),
+            ),
+        },
     )
     """The control law: a table of each registered kind (:mod:`hil.control.laws`)."""
 

@@ -20,11 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.adaptive import remember
+from hil.control.cogging import ORDERS, Harmonics, ahead, cog_params, ripple
 from hil.control.composite import predict
 from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
 from hil.control.jit import jit
-from hil.control.linalg import Array, copy, matvec, matvec_add
+from hil.control.linalg import Array, copy, exp, matvec, matvec_add
 from hil.control.mtpa import operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
@@ -117,6 +118,13 @@ LAW_PARAMS: Final = np.dtype(
         ("u_share", "f8"),
         ("every", "i8"),
         ("span", "i8"),
+        ("cogs", "i8"),
+        ("cog_order", "i8", ORDERS),
+        ("cog_a", "f8", ORDERS),
+        ("cog_b", "f8", ORDERS),
+        ("cog_lead", "f8"),
+        ("cog_lag", "f8"),
+        ("cog_slow", "f8"),
     ],
     align=True,
 )
@@ -127,7 +135,8 @@ from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hi
 ``order`` on the filter that the reported speed comes through (:mod:`hil.control.speedfilter`); lengths of an
 adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``; R_s and the share of
 the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to the next where these are
-several, else 0, and ``span``: what an innovation rests on then, where there is a filter."""
+several, else 0, and ``span``: what an innovation rests on then, where there is a filter; from ``cogs`` on the
+load torque that is known over the shaft's angle (:mod:`hil.control.cogging`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -136,8 +145,9 @@ _INNER = ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u")
 _FILTER = ("order", "v_y", "v_u", "v_s", "w_y", "w_u", "w_s", "w_d", "gap_y")
 _SALIENT = ("R_s", "u_share")
 _SELDOM = ("every", "span")
+_COGGING = ("cogs", "cog_order", "cog_a", "cog_b", "cog_lead", "cog_lag", "cog_slow")
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM), 0.0
+    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING), 0.0
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -189,6 +199,7 @@ LAW_STATE: Final = np.dtype(
         ("x_last", "f8", 3),
         ("i_d_ref", "f8"),
         ("capped", "i8"),
+        ("theta", "f8"),
     ],
     align=True,
 )
@@ -197,7 +208,7 @@ LAW_STATE: Final = np.dtype(
 of a drive's own current loop what flows, and the commands on their way, newest first; of a filtered speed
 rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
-whether the torque asked for was capped."""
+whether the torque asked for was capped; the measured angle of the shaft, where a load over it is known."""
 
 Record = npt.NDArray[np.void]
 
@@ -273,6 +284,8 @@ class LawSpec:
     more: Mapping[str, Any] = field(default_factory=dict)
     inner: InnerLoop | None = None
     """The drive's own current loop; None for a drive that takes voltages."""
+    cogging: Harmonics | None = None
+    """The load torque that is known over the shaft's angle."""
 
     def values(self) -> dict[str, Any]:
         """What the registered design takes."""
@@ -403,6 +416,16 @@ def _check_takes(spec: LawSpec, law: Any) -> None:
     )
 
 
+def _lead(spec: LawSpec, values: Mapping[str, Any], T_s: float) -> tuple[float, float]:
+    """(lead [s], lam) of :func:`hil.control.cogging.ahead`; of the law speed when its command acts."""
+    if spec.inner is not None:
+        return (1.0 + spec.inner.delay) * T_s, 0.0
+    lam = float(values.get("lam_q", 0.0))
+    if spec.kind == "pi":
+        lam = exp(-float(values["k_p"][1]) / spec.motor.L_q * T_s)
+    return (2.0 * T_s, lam) if lam > 0.0 else (1.5 * T_s, 0.0)
+
+
 def design_law(spec: LawSpec, T_s: float) -> Record:
     """Design a law: a one-element array of LAW_PARAMS. Raises ControlDesignError."""
     _check(spec)
@@ -437,6 +460,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
     if spec.inner and spec.inner.every > 1:
         values["every"] = spec.inner.every
     gain = spec.inner.k_u / motor.J if spec.inner else 0.0
+    values |= cog_params(spec.cogging, *_lead(spec, values, T_s), T_s)
     for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
         params[name] = value
     for name in ("form", "third", "g", "M", "W", "S", "short", "first"):
@@ -479,6 +503,8 @@ def start(p: Any, s: Any) -> None:
     """Take the measurement in s['x'] as the beginning of the observer's first period."""
     copy(s["x"], s["x_open"])
     known_terms(p, s["x"], s["c"])
+    if p["cogs"]:
+        s["c"][0] += ripple(p, s, 0.0)
     s["started"] = 1
     s["gap"] = 0
 
@@ -499,6 +525,8 @@ def innovate(p: Any, s: Any) -> None:
         s["work"][c] = s["x"][c] - s["x_open"][c]
     matvec(p["gap_inverse"][s["gap"] - 1], s["work"], s["v"])
     known_terms(p, s["x"], s["work"])
+    if p["cogs"]:
+        s["work"][0] += ripple(p, s, 0.0)
     for c in range(3):
         s["v"][c] -= 0.5 * (s["work"][c] - s["c"][c])
 
@@ -585,10 +613,13 @@ def look_ahead(p: Any, s: Any) -> None:
     copy(s["c"], s["work"])
     if p["short"][2] > 0:  # an adaptive window's i_d is quieter than the measured one
         known_terms(p, s["x_hat"], s["work"])
+        s["work"][0] += ripple(p, s, 0.0) if p["cogs"] else 0.0
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
     predict(p["Ad"], p["Bd"], p["Ed"], s["x_hat"], s["ua"], s["d_p"], s["x_p"])
     known_terms(p, s["x_p"], s["work"])
+    if p["cogs"]:
+        s["work"][0] += ahead(p, s)
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
 
@@ -686,6 +717,8 @@ def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
     x, k_p, k_i, total = s["x"], p["k_p"], p["k_i"], s["I"]
     e_w = w_ref - x[0]
     asked = k_p[0] * e_w + total[0] + p["J"] * dw_ref / p["k_t"]
+    if p["cogs"]:
+        asked -= p["J"] * ahead(p, s) / p["k_t"]
     i_q_ref = min(max(asked, -p["i_max"]), p["i_max"])
     total[0] += p["T_s"] * k_i[0] * (e_w + (i_q_ref - asked) / k_p[0])
     s["i_q_ref"] = i_q_ref

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from hil.control.cogging import ripple
 from hil.control.jit import jit
 from hil.control.speedfilter import enter
 
@@ -61,6 +62,8 @@ def look_ahead_speed(p: Any, s: Any) -> None:
     w, i, d = s["x"][0], s["inner"], s["d_hat"][0]
     for age in range(p["delay"], -1, -1):
         u = s["commands"][age]
+        if p["cogs"]:
+            d = s["d_hat"][0] + ripple(p, s, (p["delay"] - age + 0.5) * p["T_s"])
         w = p["Ad"][0, 0] * w + p["Bd"][0, 0] * (p["share"] * i + (1.0 - p["share"]) * u)
         w += p["Ed"][0, 0] * d
         i = p["lag"] * i + (1.0 - p["lag"]) * u
@@ -75,7 +78,8 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
         sigma+ = a sigma + e d + g u,   g = (1 - alpha) b + kappa (1 - l)
     With u* = (w*+ - a w* - e d) / b, what holds the reference, sigma* = w* + kappa u*, and
         u = (sigma*+ + lam (sigma - sigma*) - a sigma - e d) / g
-    Without a lag (kappa = 0) it is the cascade's speed law.
+    Without a lag (kappa = 0) it is the cascade's speed law. A load over the angle is known at each of these
+    moments: at both ends of the tick what holds against it, between them its effect.
     """
     look_ahead_speed(p, s)
     a, b, kappa, T_s = p["Ad"][0, 0], p["Bd"][0, 0], p["kappa"], p["T_s"]
@@ -83,8 +87,14 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     target = w_ref + (1.0 + p["delay"]) * T_s * dw_ref
     after = target + T_s * dw_ref
     holds = kappa * (after - a * target - drift) / b
+    held = holds
+    if p["cogs"]:
+        share, lead = kappa * p["Ed"][0, 0] / b, p["cog_lead"]
+        held = holds - share * ripple(p, s, lead)
+        holds -= share * ripple(p, s, lead + T_s)
+        drift += p["Ed"][0, 0] * ripple(p, s, lead + 0.5 * T_s)
     sigma = s["x_p"][0] + kappa * s["x_p"][1]
-    wanted = after + holds + p["lam_w"] * (sigma - target - holds)
+    wanted = after + holds + p["lam_w"] * (sigma - target - held)
     u = (wanted - a * sigma - drift) / p["g_u"]
     s["u"][0], s["u"][1], s["u"][2] = 0.0, u, 0.0
     s["i_q_ref"] = min(max(u / p["u_i"], -p["i_max"]), p["i_max"])

@@ -56,7 +56,8 @@ def _sections(found: list[Table]) -> Iterator[str]:
         same.setdefault("\n".join([table.kind or "", table.doc, *map(_row, table.keys)]), []).append(table)
     for alike in same.values():
         first = alike[0]
-        names = ", ".join(f"`{table.name}`" for table in alike if table.name) or "Above all tables"
+        named = dict.fromkeys(f"`{table.name}`" for table in alike if table.name)
+        names = ", ".join(named) or "Above all tables"
         yield f"### {names}" + (f', `kind = "{first.kind}"`' if first.kind else "") + f"\n\n{first.doc}\n"
         if first.keys:
             yield "| key | type | range | default | |\n|---|---|---|---|---|"

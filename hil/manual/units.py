@@ -54,6 +54,7 @@ COUNTS: Final = (
     "samples",
     "bits",
     "passes",
+    "laps",
 )
 NUMBERS: Final = (
     "on_value",

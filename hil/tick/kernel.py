@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hil.control.cogging import flows, torque_at
 from hil.control.jit import array_at, jit
 from hil.control.law import (
     LAW_PARAMS,
@@ -79,6 +80,8 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     heard = fresh and math.isfinite(t["w"]) and (not told or math.isfinite(t["i_q"]))
     periods = min(int(t["gap"]), int(lp["max_gap"]) + 1)
     ls["ua"][0] = flowed(lp, ls, t["i_q"] * lp["u_i"], heard and told, periods)
+    if lp["cogs"] and lp["order"]:
+        flows(lp, ls, periods)
     observe(lp, ls, t["w"], 0.0, 0.0, heard, t["gap"])
     if lp["every"] > 1 and not heard:
         between(lp, ls)
@@ -90,6 +93,8 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 @jit
 def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """Advance the observer by the past periods; a measurement that is not finite is no measurement."""
+    if lp["cogs"] and t["rx_flags"] & RxFlag.FRESH:
+        ls["theta"] = t["theta"]
     if lp["kind"] == SPEED:
         estimate_speed(p, s, lp, ls, t)
         return
@@ -159,10 +164,12 @@ def remember(p: Any, s: Any, t: Any) -> None:
 
 
 @jit
-def report(p: Any, ls: Any, t: Any) -> None:
-    """Write the estimates to the tick."""
+def report(p: Any, lp: Any, ls: Any, t: Any) -> None:
+    """Write the estimates to the tick; what is known of the load over the angle is part of it."""
     t["d_hat_w"], t["d_hat_q"], t["d_hat_d"] = ls["d_hat"][0], ls["d_hat"][1], ls["d_hat"][2]
     t["T_L_hat"] = -p["J"] * ls["d_hat"][0] + 0.0
+    if lp["cogs"]:
+        t["T_L_hat"] += torque_at(lp, ls["theta"], ls["x"][0])
     t["filled"] = ls["filled"]
 
 
@@ -188,7 +195,7 @@ def step(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
         t["controlword"] = Controlword.QUICK_STOP.value
         guard_command(p, s, t, 0.0, 0.0, 0.0)
     remember(p, s, t)
-    report(p, law, t)
+    report(p, q, law, t)
 
 
 @jit

@@ -107,6 +107,7 @@ def _state() -> Record:
 def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int) -> Array:
     """Responses (plants, kinds, 4, ticks), valid until the next call; without the limit of the current."""
     own = law.copy()
+    own["cogs"] = 0  # known over the angle: no part of the linear loop
     own["i_max"] = np.inf
     out = _buffer((len(plants), len(kinds), 4, ticks))
     A, b, e = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "b", "e"))
