@@ -9,11 +9,13 @@ whatever line it stands on, so what is out of date is overwritten and nothing ne
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import functools
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -144,10 +146,46 @@ class _Kernels(numba_caching.CompileResultCacheImpl):  # type: ignore[misc] # as
     _locator_classes = (KernelLocator, *numba_caching.CacheImpl._locator_classes)
 
 
+class KernelFiles(numba_caching.IndexDataCacheFile):  # type: ignore[misc] # as above
+    """The files of one function's kernels, which processes may write at the same time.
+
+    numba's own reads the index, takes a free name and writes both: of two processes with different signatures
+    each could take the same name, and one would later run the other's kernel. Its index also stands before
+    the data, so that a reader could find what an older source left under that name.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write the kernel, then the index that names it, while no other process does. Raises OSError."""
+        with _locked(self._cache_path):
+            names = self._load_index()
+            free = (
+                name for i in range(1, len(names) + 2) if (name := self._data_name(i)) not in names.values()
+            )
+            names.setdefault(key, min(free))
+            self._save_data(names[key], data)
+            self._save_index(names)
+
+
+@contextlib.contextmanager
+def _locked(folder: str) -> Iterator[None]:
+    """Hold a folder against the other processes and threads that ask for it."""
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(fd)
+
+
 class KernelCache(numba_caching.FunctionCache):  # type: ignore[misc] # as above
-    """numba's cache of one function, with :class:`KernelLocator`."""
+    """numba's cache of one function, with :class:`KernelLocator` and :class:`KernelFiles`."""
 
     _impl_class = _Kernels
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        locator, base = self._impl.locator, self._impl.filename_base
+        self._cache_file = KernelFiles(self._cache_path, base, locator.get_source_stamp())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """A kept kernel, or None. numba's own reads in first what types and implements each builtin.

@@ -6,7 +6,9 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -93,6 +95,35 @@ def test_an_installed_package_keeps_kernels_in_the_users_folder(tree: Path) -> N
     assert run(tree, XDG_CACHE_HOME=str(tree / "home")) == "7.0 0 True"
     assert list((tree / "home" / "hil-drive" / "numba").rglob("*.nbi"))
     assert not (tree / ".cache").exists()
+
+
+@pytest.mark.parametrize("left", [False, True], ids=["new", "out of date"])
+def test_two_processes_that_save_at_once_keep_both_kernels(
+    tmp_path: Path, left: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One comes when the other has read the index; what an older source left is never found."""
+    if left:
+        kernelcache.KernelFiles(str(tmp_path), "kernel", "before").save("a", "an old one")
+    one, other = (kernelcache.KernelFiles(str(tmp_path), "kernel", "now") for _ in range(2))
+    second = threading.Thread(target=other.save, args=("b", "of b"))
+    index, data = one._load_index, one._save_data
+
+    def read() -> Any:
+        found = index()
+        second.start()
+        second.join(0.3)  # it waits for the first one; else it would be done by then
+        return found
+
+    def write(name: str, kernel: str) -> None:
+        assert other.load("a") is None, "named before it is there"
+        data(name, kernel)
+
+    monkeypatch.setattr(one, "_load_index", read)
+    monkeypatch.setattr(one, "_save_data", write)
+    one.save("a", "of a")
+    second.join()
+    assert [other.load(key) for key in "abc"] == ["of a", "of b", None]
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_each_file_that_a_kernel_takes_names_from_is_found() -> None:
