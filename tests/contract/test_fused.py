@@ -1,24 +1,23 @@
 """The compiled tick against the loop's own rules: the same drive, the same disturbances, the same log.
 
-Each case runs twice, with and without the compiled tick. Everything but the stamps must be equal: every field
-of every record, the frames that passed, the events, how it ended. And each case says which stages of the tick
+Each case runs twice, with and without the compiled tick, in a process whose time is virtual: what comes when
+is written, and the host can't change it. Everything must be equal to the bit: every field of every record,
+its stamps too, the frames that passed, the events, how it ended. And each case says which stages of the tick
 were left to the loop, so that a compiled tick that left everything to it would fail.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
-import json
-import select
+import multiprocessing
 import signal
 import socket
-import sys
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +34,7 @@ from hil.log.recorder import Recorder, open_recorder
 from hil.runtime import fused
 from hil.runtime.clock import RealClock
 from hil.runtime.guardian import (
-    ARMED,
     BEAT_NS,
-    COUNTER,
     FIRED,
     GUARD_NS,
     GUARDIAN_LOST_NS,
@@ -64,52 +61,49 @@ from hil.runtime.loop import (
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
+from tests.contract import virtual
+from tests.contract.virtual import TIME
 
 pytestmark = [pytest.mark.compiled, pytest.mark.process]
 
-PERIOD_NS, TIMEOUT_NS = 10_000_000, 5_000_000  # a busy host answers within that
+PERIOD_NS, TIMEOUT_NS, ANSWER_NS = 10_000_000, 5_000_000, 1_000_000
 TICKS = 90
-TURNS = 8
-"""A host that stalls for some ms makes two runs differ; so often each may be tried against all others."""
+PATIENT_NS = 10_000_000_000
+"""A period in real time: no host is late by that."""
 STATES = {0x0: 1, 0x6: 2, 0x7: 3, 0xF: 4}
-STAMPS = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns"}
 SYNC, FEEDBACK, COMMAND, EMERGENCY, STATUS = 0x080, 0x181, 0x201, 0x081, 0x281
 
 
-@pytest.fixture(autouse=True)
-def turns() -> Iterator[None]:
-    """Loop and drive are threads of one interpreter: let neither wait long for the other's turn."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(1e-4)
-    yield
-    sys.setswitchinterval(before)
-
-
-class Drive(threading.Thread):
-    """Answers SYNC over the other end of the loop's socket; ``act`` says how."""
+class Drive:
+    """Answers SYNC over the other end of the loop's socket a millisecond later; ``act`` says how."""
 
     def __init__(self, setup: Setup, end: socket.socket, words: Words, act: Act) -> None:
-        super().__init__()
         self.end, self.words, self._act = end, words, act
         self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
-        self._over = threading.Event()
-        self.counter = self._echo = self._state = 0
+        self.counter = self._echo = self._state = self._beats = self._deaf_until = 0
         self.operator, self.speed = StopRequest(), 0.0
         self.heard: list[int] = []
+        self._then: list[Callable[[], None]] = []
 
-    def run(self) -> None:
-        n = 0
-        self.end.settimeout(0.05)
-        while not self._over.is_set():
-            try:
-                raw = self.end.recv(128)
-            except TimeoutError:
-                continue
-            except OSError:
-                return
-            if self.take(raw) == SYNC:
-                self.beat(n)
-                n += 1
+    def begin(self) -> None:
+        """Listen whenever the loop waits."""
+        TIME.listen = self.listen
+
+    def listen(self) -> None:
+        """Take all that the loop has sent."""
+        if TIME.now_ns < self._deaf_until:
+            return
+        with contextlib.suppress(OSError):  # nothing more, or no longer an end
+            while True:
+                can_id = self.take(self.end.recv(128, socket.MSG_DONTWAIT))
+                if can_id == COMMAND and self._then:
+                    self._then.pop()()
+                self.hears(can_id)
+
+    def hears(self, can_id: int) -> None:
+        """What a frame sets off."""
+        if can_id == SYNC:
+            TIME.after(ANSWER_NS, self.beat)
 
     def take(self, raw: bytes) -> int:
         """What a frame of the loop's asks; returns its identifier."""
@@ -119,11 +113,21 @@ class Drive(threading.Thread):
             self._echo, self._state = data[1] & 15, STATES.get(data[2] | data[3] << 8, self._state)
         return int(can_id)
 
-    def beat(self, n: int) -> None:
-        """The guardian's sign of life, and the n-th answer."""
-        self.words.cells[GUARD_NS] = time.monotonic_ns()
+    def beat(self) -> None:
+        """The guardian's sign of life, and the next answer."""
+        n, self._beats = self._beats, self._beats + 1
+        self.words.cells[GUARD_NS] = TIME.now_ns
         with contextlib.suppress(OSError):  # the loop may have ended
             self._act(self, n)
+
+    def after_command(self, act: Callable[[], None]) -> None:
+        """Do that when the next command has come."""
+        self._then.append(act)
+
+    def deaf(self, ns: int, act: Callable[[], None]) -> None:
+        """Hear nothing for so long, then do that."""
+        self._deaf_until = TIME.now_ns + ns
+        TIME.after(ns, act)
 
     def feedback(self, n: int) -> bytes:
         """Feedback on the n-th SYNC, with the next counter: never twice the same speed."""
@@ -144,58 +148,66 @@ class Drive(threading.Thread):
         )
 
     def stop(self) -> None:
-        self._over.set()
-        self.join()
+        """What was sent to it counts, nothing more comes of it."""
+        self.listen()
+        TIME.restart()
 
 
 class Cyclic(Drive):
-    """Sends by itself a period after each command: its clock and the loop's wait can't drift apart."""
+    """Sends by itself a period after each command; without one the next comes before the loop gives up."""
 
-    def run(self) -> None:
-        n = 0
-        self.end.settimeout(0.3e-9 * PERIOD_NS)  # without a command the next comes before the loop gives up
-        while not self._over.is_set():
-            try:
-                time.sleep(PERIOD_NS * 1e-9)
-                self.beat(n)
-                while self.take(self.end.recv(128)) != COMMAND:
-                    pass
-            except TimeoutError:
-                pass
-            except OSError:
-                return
-            n += 1
+    def begin(self) -> None:
+        super().begin()
+        self._awaits = 0
+        TIME.after(PERIOD_NS, self.beat)
+
+    def beat(self) -> None:
+        super().beat()
+        self._awaits = mine = self._beats
+        TIME.after(PERIOD_NS * 3 // 10, lambda: self.goes_on(mine))
+
+    def hears(self, can_id: int) -> None:
+        if can_id == COMMAND:
+            self.goes_on(self._awaits)
+
+    def goes_on(self, beats: int) -> None:
+        """The next is a period from now, unless it is on its way."""
+        if beats and beats == self._awaits:
+            self._awaits = 0
+            TIME.after(PERIOD_NS, self.beat)
 
 
 class Timed(Drive):
     """Sends SYNC, too, by a timer that the loop's job has started: the Broadcast Manager's part."""
 
     def __init__(self, setup: Setup, end: socket.socket, words: Words, act: Act) -> None:
-        super().__init__(setup, end, words, act)
         pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM) for _ in range(2)]
         (job, self.job), (ear, self.ear) = pairs
         ear.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self.sync = KernelSync(job, ear, SYNC, True, PERIOD_NS)
         self.asked: list[bytes] = []
+        super().__init__(setup, end, words, act)
 
-    def run(self) -> None:
-        self.asked.append(self.job.recv(8192))
-        n, next_ns = 0, time.monotonic_ns()
-        while not self._over.is_set():
-            if self.asked[-1][0] != TX_DELETE:
-                self.beat(n)
-            n, next_ns = n + 1, next_ns + PERIOD_NS
-            self.until(next_ns)
+    def listen(self) -> None:
+        super().listen()
+        with contextlib.suppress(OSError):  # nothing more, or closed
+            while not self.asked or self.asked[-1][0] != TX_DELETE:
+                self.asked.append(self.job.recv(8192, socket.MSG_DONTWAIT) or bytes((TX_DELETE,)))
+                if len(self.asked) == 1:
+                    TIME.after(0, self.beat)
 
-    def until(self, then_ns: int) -> None:
-        """Take what the loop sends and asks of the job meanwhile."""
-        while (left := then_ns - time.monotonic_ns()) > 0:
-            going = [self.job] if self.asked[-1][0] != TX_DELETE else []
-            ready, _, _ = select.select([self.end, *going], [], [], left * 1e-9)
-            if self.end in ready:
-                self.take(self.end.recv(128))
-            if self.job in ready:
-                self.asked.append(self.job.recv(8192) or bytes((TX_DELETE,)))
+    def hears(self, can_id: int) -> None:
+        """Its own timer alone sets it off."""
+
+    def beat(self) -> None:
+        if self.asked[-1][0] != TX_DELETE:
+            super().beat()
+            TIME.after(PERIOD_NS, self.beat)
+
+    def send_sync(self, count: int) -> None:
+        """SYNC, with its stamp."""
+        TIME.stamps.append(TIME.now_ns)
+        self.ear.send(sync_frame(count))
 
     def stop(self) -> None:
         super().stop()
@@ -205,6 +217,7 @@ class Timed(Drive):
 
 
 Act = Callable[[Any, int], None]
+Both = Callable[..., tuple[Any, Any]]
 
 
 def calm(drive: Drive, n: int) -> None:
@@ -250,8 +263,7 @@ def silent(drive: Drive, n: int) -> None:
 @now_and_then(30, 50)
 def late(drive: Drive, n: int) -> None:
     """After the loop has given up and sent its command, before the next SYNC."""
-    assert drive.end.recv(128)[:2] == COMMAND.to_bytes(2, "little")
-    drive.end.send(drive.feedback(n))
+    drive.after_command(lambda: drive.end.send(drive.feedback(n)))
 
 
 @now_and_then(30, 50)
@@ -265,12 +277,12 @@ def between(*raws: bytes) -> Act:
     """Frames after the command, a stranger's and feedback around them: the next tick finds them waiting."""
 
     def act(drive: Drive, n: int) -> None:
+        def rest() -> None:
+            for raw in (pack_frame(0x500, bytes(3)), *raws, drive.feedback(n)):
+                drive.end.send(raw)
+
         drive.end.send(drive.feedback(n))
-        assert drive.end.recv(128)[:2] == COMMAND.to_bytes(2, "little")
-        drive.end.send(pack_frame(0x500, bytes(3)))
-        for raw in raws:
-            drive.end.send(raw)
-        drive.end.send(drive.feedback(n))
+        drive.after_command(rest)
 
     return act
 
@@ -331,7 +343,7 @@ def timed(answer: Act, *silent: int) -> Act:
 
     def act(drive: Timed, n: int) -> None:
         if n not in silent:
-            drive.ear.send(sync_frame(n - sum(other < n for other in silent)))
+            drive.send_sync(n - sum(other < n for other in silent))
         answer(drive, n)
 
     return act
@@ -342,15 +354,13 @@ def timed(answer: Act, *silent: int) -> Act:
 def answered_late(drive: Timed, n: int) -> None:
     """Feedback after the loop gave up, and before the next SYNC: it is not applied."""
     raw = drive.feedback(n)
-    while drive.take(drive.end.recv(128)) != COMMAND:
-        pass
-    drive.end.send(raw)
+    drive.after_command(lambda: drive.end.send(raw))
 
 
 @timed
 @now_and_then(60)
 def sync_of_another(drive: Timed, n: int) -> None:
-    drive.ear.send(sync_frame(n + 99))
+    drive.send_sync(n + 99)
     calm(drive, n)
 
 
@@ -362,8 +372,7 @@ def gone(drive: Drive, n: int) -> None:
 @now_and_then(50)
 def deaf(drive: Drive, n: int) -> None:
     """Nothing is read for as long as it takes to fill the queue to the drive."""
-    time.sleep(0.255)
-    calm(drive, n)
+    drive.deaf(255_000_000, lambda: calm(drive, n))
 
 
 @now_and_then(60)
@@ -383,12 +392,17 @@ def guardian_dies(drive: Drive, n: int) -> None:
 class Ran:
     """What a run left."""
 
-    log: Log
+    path: Path
     stages: Counter[int]
     heard: list[int]
     ended: str
     words: list[int]
     failure: str = ""
+
+    @cached_property
+    def log(self) -> Log:
+        """Its log."""
+        return open_log(self.path)
 
 
 @contextlib.contextmanager
@@ -396,6 +410,7 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
     """Two ends of a wire; each frame is a datagram."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # room for some frames
+    theirs.setblocking(False)
     with ours, theirs:
         yield ours, theirs
 
@@ -406,19 +421,24 @@ def setup_of(*more: str) -> Setup:
     return load_setup(CONFIGS / "demo.toml", Overrides(settings=settings))
 
 
-def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) -> Ran:
-    """A run of the loop with its guardian's words, recorder and log, against that drive."""
+def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: bool) -> Ran:
+    """A run of the loop with its guardian's words, recorder and log, against the drive of that case.
+
+    For a process of virtual time, which it begins anew.
+    """
+    TIME.restart()
+    setup, act = setup_of(*settings), TABLES[case[0]][case[1]][0]
     request = StopRequest()
     stages: Counter[int] = Counter()
     words, machine = Words(), setup.machine.fresh()
-    words.cells[GUARD_NS] = time.monotonic_ns()
+    words.cells[GUARD_NS] = TIME.now_ns
     pacing = setup.config.loop.pacing
-    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, ticks)
+    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
     recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
     recorder.await_open()
     failure = ""
     with ends() as (ours, theirs):
-        other = Timed if act in TIMED else Drive if pacing == "sync" else Cyclic
+        other = Timed if case[0] == "by the kernel" else Drive if pacing == "sync" else Cyclic
         drive = other(setup, theirs, words, act)
         sync = drive.sync if isinstance(drive, Timed) else None
         link = SocketLink(None, ours, ours)
@@ -439,63 +459,57 @@ def run(setup: Setup, path: Path, act: Act, compiled: bool, ticks: int = TICKS) 
         parts = guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole
         loop = Loop(*parts, timed=sync)
         drive.operator = request
-        drive.start()
+        TIME.restart()  # kernels that were compiled meanwhile have waited
+        drive.begin()
         try:
             outcome = loop.run()
         except Exception as error:  # noqa: BLE001 - the two runs are compared in how they fail, too
             outcome, failure = loop._outcome, f"{type(error).__name__}: {error}"
         finally:
-            recorder.close({"ended": "in time"})
             drive.stop()
-    log, ended = open_log(path), Reason(outcome.reason).name
-    return Ran(log, stages, drive.heard, ended, words.cells.tolist()[:5], failure)
-
-
-def paced_by_drive(ran: Ran) -> bool:
-    """The drive's own clock goes on in the stop, too."""
-    return bool(json.loads(ran.log.attachments["config.json"])["loop"]["pacing"] == "feedback")
-
-
-def in_time(ran: Ran) -> tuple[list[tuple[int, bytes, bool]], list[int]]:
-    """Frames up to the last tick, and what the drive heard of them: what follows depends on who is faster."""
-    end_ns = int(ran.log.ticks["t_ns"][-1]) + int(ran.log.ticks["sent_ns"][-1])
-    frames = [(f.can_id, f.data, f.received) for f in ran.log.frames if f.t_ns <= end_ns]
-    return frames, ran.heard[: sum(not received for _, _, received in frames)]
+            recorder.close({"ended": "in time"})
+    if TIME.trouble:
+        raise TIME.trouble[0]
+    ended = Reason(outcome.reason).name
+    return Ran(path, stages, drive.heard, ended, words.cells.tolist()[:5], failure)
 
 
 def assert_same(rules: Ran, compiled: Ran) -> None:
-    """Every field of every record, every frame, every event, and the end."""
+    """Every field of every record, its stamps, every frame, every event, and the end."""
     assert (compiled.ended, compiled.failure) == (rules.ended, rules.failure)
     assert len(compiled.log.ticks) == len(rules.log.ticks)
     for one in FIELDS:
-        if one.name not in STAMPS | {"check"}:
-            theirs, ours = rules.log.ticks[one.name], compiled.log.ticks[one.name]
-            assert theirs.tobytes() == ours.tobytes(), one.name
-    for ran in (rules, compiled):  # the check is of the stamps too: each must fit its own
+        theirs, ours = rules.log.ticks[one.name], compiled.log.ticks[one.name]
+        assert theirs.tobytes() == ours.tobytes(), one.name
+    for ran in (rules, compiled):
         assert first_broken(ran.log.ticks, ran.log.absent) is None and ran.log.ticks["check"].all()
-    at = [ran.log.ticks["t_ns"] - ran.log.ticks["t_ns"][0] for ran in (rules, compiled)]
-    assert (at[0] == at[1]).all()
-    if paced_by_drive(rules):
-        assert in_time(rules) == in_time(compiled)
-    else:
-        passed = [[(f.can_id, f.data, f.received) for f in ran.log.frames] for ran in (rules, compiled)]
-        assert passed[0] == passed[1] and compiled.heard == rules.heard
-    told = [[(e["k"], e["kind"], e["text"]) for e in ran.log.events] for ran in (rules, compiled)]
+    passed = [[(f.t_ns, f.can_id, f.data, f.received) for f in ran.log.frames] for ran in (rules, compiled)]
+    assert passed[0] == passed[1] and compiled.heard == rules.heard
+    told = [[(e["t_ns"], e["k"], e["kind"], e["text"]) for e in ran.log.events] for ran in (rules, compiled)]
     assert told[0] == told[1]
-    assert compiled.words[ARMED] == rules.words[ARMED] and compiled.words[COUNTER] == rules.words[COUNTER]
+    assert compiled.words == rules.words
 
 
-def both(setup: Setup, folder: Path, act: Act) -> tuple[Ran, Ran]:
-    """(by the loop's rules, compiled): the first two of all turns that are the same, else the last."""
-    ran: dict[bool, list[Ran]] = {False: [], True: []}
-    for turn in range(TURNS):
-        for form, runs in ran.items():
-            runs.append(run(setup, folder / f"{turn}-{form}.mcap", act, form))
-        for rules, compiled in itertools.product(*ran.values()):
-            with contextlib.suppress(AssertionError):
-                assert_same(rules, compiled)
-                return rules, compiled
-    return ran[False][-1], ran[True][-1]
+@pytest.fixture(scope="module")
+def elsewhere() -> Iterator[ProcessPoolExecutor]:
+    """A process that lives in virtual time."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, context, virtual.begin) as pool:
+        yield pool
+
+
+@pytest.fixture
+def both(elsewhere: ProcessPoolExecutor, tmp_path: Path) -> Both:
+    """Runs a case with these settings (by the loop's rules, compiled)."""
+
+    def made(case: tuple[str, str], *settings: str) -> tuple[Ran, Ran]:
+        rules, compiled = (
+            elsewhere.submit(run, settings, tmp_path / f"{form}.mcap", case, form).result()
+            for form in (False, True)
+        )
+        return rules, compiled
+
+    return made
 
 
 CASES: dict[str, tuple[Act, set[int], str]] = {
@@ -520,23 +534,23 @@ CASES: dict[str, tuple[Act, set[int], str]] = {
 }
 
 
-def test_the_ramp_of_a_stop_is_compiled(tmp_path: Path) -> None:
+def stopped(drive: Drive, n: int) -> None:
+    """The operator asks for a stop before the answer that the loop waits for: it is the same tick in both."""
+    if n == 40:
+        drive.operator.stop()
+    drive.speed = 2.0 if n < 70 else 0.0
+    calm(drive, n)
+
+
+def test_the_ramp_of_a_stop_is_compiled(both: Both) -> None:
     """Each tick of it is the compiled one, the events are the loop's."""
-
-    def act(drive: Drive, n: int) -> None:
-        if n == 40:  # before the answer that the loop waits for, so that it is the same tick in both
-            drive.operator.stop()
-        drive.speed = 2.0 if n < 70 else 0.0
-        calm(drive, n)
-
     up = (
         "reference.w_rad_s=2.0",
         "reference.at_s=0.0",
         "reference.rate_rad_s2=200.0",
         "reference.jerk_rad_s3=1e5",
     )
-    setup = setup_of(*up, "stop.ramp_rad_s2=80.0")
-    rules, compiled = both(setup, tmp_path, act)
+    rules, compiled = both(("ramp", "stop"), *up, "stop.ramp_rad_s2=80.0")
     assert_same(rules, compiled)
     asked = compiled.log.ticks["request"] == Request.RAMP_DOWN
     w_ref = compiled.log.ticks["w_ref"][asked]
@@ -551,9 +565,9 @@ EXACT = {name for name, (_, left, _) in CASES.items() if left <= {SENT, BEGUN} o
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_a_compiled_tick_is_the_loops_own(name: str, tmp_path: Path) -> None:
-    act, left, ended = CASES[name]
-    rules, compiled = both(setup_of(), tmp_path, act)
+def test_a_compiled_tick_is_the_loops_own(name: str, both: Both) -> None:
+    _, left, ended = CASES[name]
+    rules, compiled = both(("by us", name))
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     assert name not in EXACT or set(compiled.stages) - {RECORDED} == left, compiled.stages
@@ -581,9 +595,9 @@ FOLLOWED: dict[str, tuple[Act, set[int], str]] = {
 
 
 @pytest.mark.parametrize("name", FOLLOWED)
-def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, tmp_path: Path) -> None:
-    act, left, ended = FOLLOWED[name]
-    rules, compiled = both(setup_of('loop.pacing="feedback"'), tmp_path, act)
+def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, both: Both) -> None:
+    _, left, ended = FOLLOWED[name]
+    rules, compiled = both(("by feedback", name), 'loop.pacing="feedback"')
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     assert compiled.stages[NOT_BEGUN] == 1 or ended in ("SEND_FAILED", "GUARDIAN")
@@ -601,13 +615,19 @@ BY_THE_KERNEL: dict[str, tuple[Act, set[int], str]] = {
     "emergency": (timed(alarm), {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
     "the guardian fires": (timed(fired), {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
 }
-TIMED = [act for act, _, _ in BY_THE_KERNEL.values()]
+TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
+    "by us": CASES,
+    "by feedback": FOLLOWED,
+    "by the kernel": BY_THE_KERNEL,
+    "ramp": {"stop": (stopped, set(), "STOP_REQUESTED")},
+}
+"""Who sends SYNC, or that nobody does; then what happens."""
 
 
 @pytest.mark.parametrize("name", BY_THE_KERNEL)
-def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, tmp_path: Path) -> None:
-    act, left, ended = BY_THE_KERNEL[name]
-    rules, compiled = both(setup_of('loop.pacing="feedback"'), tmp_path, act)
+def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, both: Both) -> None:
+    _, left, ended = BY_THE_KERNEL[name]
+    rules, compiled = both(("by the kernel", name), 'loop.pacing="feedback"')
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     assert compiled.ended == ended and not rules.stages
@@ -621,10 +641,9 @@ def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, tmp_pat
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A client, its compiled tick and the other end of the wire, without a loop."""
     setup, words = setup_of(), Words()
-    machine, plan = setup.machine.fresh(), Plan(PERIOD_NS, TIMEOUT_NS, "sync", TICKS)
+    machine, plan = setup.machine.fresh(), Plan(PATIENT_NS, TIMEOUT_NS, "sync", TICKS)
     recorder = open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "monotonic"), 1000)
     with ends() as (ours, theirs):
-        theirs.setblocking(False)
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
         client.prepare(recorder.record[0])
         whole = fused.whole_tick(client, words, machine, recorder, plan, new_pace())
@@ -650,7 +669,7 @@ class Parts:
 
 def test_a_tick_that_is_late_by_a_period_is_the_loops(parts: Parts) -> None:
     before = parts.record.tobytes()
-    assert parts.whole(7, time.monotonic_ns() - PERIOD_NS, 1, False) == NOT_BEGUN
+    assert parts.whole(7, time.monotonic_ns() - PATIENT_NS, 1, False) == NOT_BEGUN
     assert parts.silent() and parts.record.tobytes() == before
 
 
