@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -17,13 +18,14 @@ from typing import Any, Final, Literal, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Channel, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
+from hil.log.ahead import ahead
 from hil.log.container import FIXED_BYTES, LIBRARY
 from hil.log.errors import DamagedError, LogError, UnknownCompressionError
 from hil.log.layouts import FORMAT
 from hil.log.mcapfile import MESSAGE
-from hil.log.scan import Raw, chunk_content, chunk_rows, gathered, parse, parse_attachment, raw_records
+from hil.log.scan import Raw, chunk_rows, gathered, parse, parse_attachment, raw_records
 from hil.log.schema import (
     FRAME_HEAD,
     FRAME_MESSAGE,
@@ -149,8 +151,8 @@ class _Pass:
         self.unreadable = ""
         """Why no chunk could be read at all."""
 
-    def take(self, raw: Raw) -> Iterator[Block]:
-        """What a record of the file brings; one that is damaged is named and left out."""
+    def take(self, raw: Raw, content: Future[bytes] | None) -> Iterator[Block]:
+        """What a record of the file brings, ``content`` that of a chunk; one that is damaged is named."""
         if raw.opcode in (Opcode.CHUNK, MESSAGE) and not self._begun:
             self._begun = True
             self._look_ahead(raw.offset)
@@ -160,12 +162,10 @@ class _Pass:
                 self.log.attachments[name] = data.decode(errors="replace")
             elif raw.opcode == MESSAGE:
                 yield from self._chunk(raw.content)
-            else:
-                record = parse(raw.opcode, raw.content)
-                if isinstance(record, Chunk):
-                    yield from self._chunk(chunk_content(record))
-                elif record is not None:
-                    self._define(record)
+            elif content is not None:
+                yield from self._chunk(content.result())
+            elif (record := parse(raw.opcode, raw.content)) is not None:
+                self._define(record)
         except DamagedError as error:
             self.problems.append(f"{error} (at byte {raw.offset})")
             self.log.bytes_lost += len(raw.content)
@@ -274,7 +274,8 @@ class _Pass:
         same = (messages["opcode"] == MESSAGE) & (messages["channel"] == self._tick_channel)
         if not (same & (messages["length"] == FIXED_BYTES + layout.itemsize)).all():
             return None
-        records = np.ascontiguousarray(messages["data"]).view(layout)
+        rows = np.frombuffer(data, np.uint8).reshape(len(messages), -1)
+        records = rows[:, -layout.itemsize :].copy().view(layout)[:, 0]  # a field of void is copied slowly
         return self._form.today(records) if self._form.fits(records) else None
 
     def _messages(self, topic: str, data: bytes, rows: Rows) -> Iterator[Block]:
@@ -390,8 +391,8 @@ def _read_file(log: Log) -> Iterator[Block]:
     """One file."""
     one = _Pass(log)
     try:
-        for raw in gathered(raw_records(log.path)):
-            yield from one.take(raw)
+        for raw, content in ahead(gathered(raw_records(log.path))):
+            yield from one.take(raw, content)
     except DamagedError as error:
         one.problems.append(str(error))
     except OSError as error:
