@@ -282,6 +282,11 @@ class DriveClient:
         self._take_late(tick)
         self._send_sync()
 
+    def follow(self, tick: Any) -> None:
+        """:meth:`sync` of a client beside another one, which sends SYNC for both."""
+        self._cells[_GOT] = 0
+        self._take_late(tick)
+
     def exchange(self, tick: Any, deadline_ns: int) -> None:
         """:meth:`sync` and :meth:`receive`, in one compiled call where nothing is late. Raises as they do."""
         code = PENDING

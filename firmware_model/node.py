@@ -238,11 +238,15 @@ class Node:
             self._advance_to(now_ns)
         kernels = self._kernels
         kernels.sync()
-        if self._faults is not None:
-            self._faults.after(kernels.state, kernels.sample)
+        self._after_sampling()
         self._frames.feedback = self._cycles % self._every == 0
         self._cycles += 1
         self._send(self._frames.answer(kernels.sampled()))
+
+    def _after_sampling(self) -> None:
+        """What becomes of the sample before it is sent."""
+        if self._faults is not None:
+            self._faults.after(self._kernels.state, self._kernels.sample)
 
     def _send(self, frames: Sequence[Sent]) -> None:
         """A drive does not stop for a bus that is down; its watchdog does."""

@@ -57,6 +57,8 @@ class Request(IntEnum):
     """A stop that was asked for, while the reference still ramps to 0: see :mod:`hil.tick.setpoint`."""
     STOP = 3
     QUICK_STOP = 4
+    NODE_STOPPED = 5
+    """Another node of the same run has left operation by a fault or a quick stop."""
 
 
 class RxFlag(IntEnum):
@@ -115,6 +117,7 @@ class Reason(IntEnum):
     FOLLOWING_ERROR = 28
     CURRENT_UNCONTROLLED = 29
     STALE_STATUS = 30
+    NODE_STOPPED = 31
 
 
 class GuardFlag(IntEnum):

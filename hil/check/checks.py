@@ -26,6 +26,7 @@ from hil.control.law import CASCADE, PI
 from hil.errors import ConfigError, HilError, plain
 from hil.runtime.bus import bus_settings, is_emulated_bus
 from hil.runtime.header import log_path
+from hil.runtime.nodesetup import Nodes, nodes_load
 from hil.runtime.refusals import LOAD_REMEDY, load_found, needed_bytes
 from hil.runtime.setup import Setup
 from hil.signals import DriveState
@@ -64,6 +65,21 @@ def check(setup: Setup) -> list[Row]:
     ]
 
 
+def check_nodes(setups: Nodes) -> list[Row]:
+    """:func:`check` of several nodes: each one's rows with its name, bus load and machine once."""
+    (_, first), *_ = setups.items()
+    config = first.config
+    rows = bus_rows(first)
+    for name, setup in setups.items():
+        own = [*reach_rows(setup), *speed_filter_rows(setup), *adaptive_rows(setup)]
+        own += [*heard_rows(setup), *canopen_rows(setup)]
+        rows += [replace(one, check=f"{name}: {one.check}") for one in own]
+    found, good = nodes_load(setups)
+    rows += [row("bus load", good, found, LOAD_REMEDY), *realtime_rows(config.realtime)]
+    needed = len(setups) * needed_bytes(config)
+    return [*rows, clock_row(config.loop.period_ns), disk_row(log_path(first, "check"), needed)]
+
+
 def reach_rows(setup: Setup) -> list[Row]:
     """What the configuration asks for and can't get; on a bus that may be real no run starts with it."""
     if not setup.warnings:
@@ -91,7 +107,7 @@ def passed(rows: list[Row]) -> bool:
 
 def check_table(rows: list[Row]) -> Table:
     """The rows for a terminal."""
-    asked = any(r.check == "canopen" for r in rows)
+    asked = any(r.check.endswith("canopen") for r in rows)
     sent = "asked by SDO, nothing else was sent" if asked else "nothing was sent"
     table = Table(title=f"hil check ({sent})", title_justify="left")
     for title in ("check", "verdict", "found", "remedy"):

@@ -165,7 +165,7 @@ def _on_the_bus(args: argparse.Namespace, file: Path, cogging: bool = False) -> 
         raise HilError("--emulated: the bus may carry a real drive; take -i hil-local, or leave it out")
     check_arming(setup, args.arm)
     if not (args.yes or emulated):
-        confirm(setup.config, sys.stdin, sys.stderr)
+        confirm([setup.config], sys.stdin, sys.stderr)
     with _emulator(args, given, setup.config):
         if cogging:
             learned = on_the_bus(args.config, setup.config, say, arm=args.arm)

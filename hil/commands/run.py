@@ -41,17 +41,24 @@ def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
     with lean_imports():
         from hil.runtime.bus import is_emulated_bus
+        from hil.runtime.nodesession import run_nodes
+        from hil.runtime.nodesetup import load_node_setups
         from hil.runtime.refusals import check_arming
         from hil.runtime.session import run
         from hil.runtime.setup import load_setup
     from hil.runtime.arming import confirm, requesting
 
-    setup = load_setup(args.config, overrides(args))
-    check_arming(setup, args.arm)
-    if not (args.yes or args.shadow or is_emulated_bus(setup.config)):
-        confirm(setup.config, sys.stdin, sys.stderr)
+    nodes = load_node_setups(args.config, overrides(args))
+    setups = list(nodes.values()) if nodes else [load_setup(args.config, overrides(args))]
+    for setup in setups:
+        check_arming(setup, args.arm)
+    if not (args.yes or args.shadow or is_emulated_bus(setups[0].config)):
+        confirm([setup.config for setup in setups], sys.stdin, sys.stderr)
     with requesting(args.dead_man, sys.stdin, say) as request:
-        result = run(setup, arm=args.arm, request=request)
+        if nodes:
+            result = run_nodes(nodes, arm=args.arm, request=request)
+        else:
+            result = run(setups[0], arm=args.arm, request=request)
     if args.json:
         print_json(result.as_dict())
     else:
@@ -66,11 +73,13 @@ def cmd_run(args: argparse.Namespace) -> int:
 
 def cmd_check(args: argparse.Namespace) -> int:
     """Check everything before arming."""
-    from hil.check.checks import check, check_table, passed
+    from hil.check.checks import check, check_nodes, check_table, passed
     from hil.report.view import show
+    from hil.runtime.nodesetup import load_node_setups
     from hil.runtime.setup import load_setup
 
-    rows = check(load_setup(args.config, overrides(args)))
+    nodes = load_node_setups(args.config, overrides(args))
+    rows = check_nodes(nodes) if nodes else check(load_setup(args.config, overrides(args)))
     if args.json:
         print_json({"rows": [row.as_dict() for row in rows]})
     else:

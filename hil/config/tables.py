@@ -32,6 +32,7 @@ from pydantic import (
     model_validator,
 )
 
+from hil.config.nodes import chosen
 from hil.control.cogging import MOST_ORDER, ORDERS, Harmonics
 from hil.control.registry import REQUIRED, Key, laws, observers
 from hil.errors import ConfigError
@@ -954,6 +955,8 @@ def load_toml(path: Path, model: type[Model], overrides: Iterable[str] = ()) -> 
     data = read_toml(path)
     for text in overrides:
         override(data, text, path.parent)
+    if model is RunConfig:
+        data = chosen(data, str(path))
     return validate(data, model, str(path), path.parent)
 
 

@@ -26,6 +26,7 @@ from hil.log.schema import (
     file_descriptor_set,
     frame_messages,
     meanings,
+    node_topic,
     pack_event,
     pack_stats,
     units,
@@ -57,7 +58,9 @@ class RunFile:
         self._form = form_of([row for row in OWN if row[1] not in absent])
         self._out = Container(path, header.get("compression", "zstd"))
         self._limit = chunk_bytes
-        self._ticks, self._others = Block(), Block()
+        self._nodes: list[str] = header.get("nodes", [])
+        self._ticks = {topic: Block() for topic in ("/tick", *map(node_topic, self._nodes))}
+        self._others = Block()
         self.ticks = self.frames = 0
         try:
             self._open(header)
@@ -70,9 +73,12 @@ class RunFile:
         descriptors = file_descriptor_set(self._absent).SerializeToString()
         schemas = {name: self._out.add_schema(name, descriptors) for name in sorted(set(TOPICS.values()))}
         self._channels = {
-            topic: self._out.add_channel(topic, schemas[name]) for topic, name in TOPICS.items()
+            topic: self._out.add_channel(topic, schemas[name])
+            for topic, name in (*TOPICS.items(), *((node_topic(n), TOPICS["/tick"]) for n in self._nodes))
         }
         self._out.add_metadata("run", {str(k): str(v) for k, v in header.get("metadata", {}).items()})
+        for name, values in header.get("more", {}).items():
+            self._out.add_metadata(name, {str(k): str(v) for k, v in values.items()})
         self._out.add_metadata("units", units())
         self._out.add_metadata("meanings", meanings())
         for name, text in header.get("attachments", {}).items():
@@ -87,25 +93,26 @@ class RunFile:
         """Write metadata of another name."""
         self._out.add_metadata(name, values)
 
-    def add_ticks(self, ticks: TickArray) -> None:
-        """Append tick records (any number)."""
+    def add_ticks(self, ticks: TickArray, node: str = "") -> None:
+        """Append tick records (any number), of another ``node`` than the first by its name."""
         per_chunk = max(1, self._limit // self._form.message.itemsize)
         for at in range(0, len(ticks), per_chunk):
-            self._add_ticks(ticks[at : at + per_chunk])
-        self.ticks += len(ticks)
+            self._add_ticks(ticks[at : at + per_chunk], node_topic(node) if node else "/tick")
+        self.ticks += 0 if node else len(ticks)
 
-    def _add_ticks(self, ticks: TickArray) -> None:
+    def _add_ticks(self, ticks: TickArray, topic: str) -> None:
         layout, message = self._form.layout, self._form.message
         messages = np.empty(len(ticks), message)
-        self._head(messages, self._channels["/tick"], ticks["t_ns"], ticks["k"] & 0xFFFFFFFF)
+        self._head(messages, self._channels[topic], ticks["t_ns"], ticks["k"] & 0xFFFFFFFF)
         messages["length"] = FIXED_BYTES + layout.itemsize
         messages["data"] = logged_as(ticks, self._form).view(f"V{layout.itemsize}")
         if NAME not in self._absent:
             seal(messages["data"].view(layout), self._absent)
         lengths = np.full(len(ticks), message.itemsize, np.int64)
-        self._ticks.add(messages["channel"].astype(np.int64), ticks["t_ns"], lengths, messages.tobytes())
-        if self._ticks.size + message.itemsize > self._limit:
-            self._ticks = self._close(self._ticks)
+        block = self._ticks[topic]
+        block.add(messages["channel"].astype(np.int64), ticks["t_ns"], lengths, messages.tobytes())
+        if block.size + message.itemsize > self._limit:
+            self._ticks[topic] = self._close(block)
 
     @staticmethod
     def _head(messages: Records, channels: Column, times: Column, sequence: Column) -> None:
@@ -170,7 +177,8 @@ class RunFile:
 
     def flush(self) -> None:
         """Close the chunks in the making and hand them to the operating system."""
-        self._ticks = self._close(self._ticks)
+        for topic, block in self._ticks.items():
+            self._ticks[topic] = self._close(block)
         self._others = self._close(self._others)
 
     def finish(self, result: dict[str, Any]) -> None:

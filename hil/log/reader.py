@@ -34,6 +34,7 @@ from hil.log.schema import (
     file_descriptor_set,
     frames_from_messages,
     message_layout,
+    node_topic,
     unpack_event,
 )
 from hil.log.summary import later
@@ -93,15 +94,26 @@ class Log:
     """Fields of today's ticks that the log lacks; what stands in their place was not logged."""
     unknown: tuple[str, ...] = ()
     """Fields of its ticks that this version does not know and passes by."""
+    node: str = ""
+    """Of a run with several nodes the one whose ticks and controller these are; empty: the first."""
 
     @property
     def result(self) -> dict[str, Any]:
-        """The run's result, empty when the run did not end properly."""
+        """The run's result, of a node after the first with what is its own; empty for a run cut short."""
         try:
             out = json.loads(self.metadata.get("result", {}).get("result", "{}"))
         except ValueError:
             return {}
-        return out if isinstance(out, dict) else {}
+        if not isinstance(out, dict):
+            return {}
+        nodes = out.get("nodes")
+        own = nodes.get(self.node) if self.node and isinstance(nodes, dict) else None
+        return out | own if isinstance(own, dict) else out
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the nodes of a run with several, the first first; none for a run with one."""
+        return tuple(filter(None, self.metadata.get("nodes", {}).get("names", "").split(",")))
 
     def __enter__(self) -> Self:
         return self
@@ -148,6 +160,9 @@ class _Pass:
         self.problems: list[str] = []
         self.messages_seen = 0
         self._begun = False
+        self._owned: set[tuple[int, str]] = set()
+        """Attachments and metadata of the node that is read."""
+        self._tick_topic = node_topic(log.node) if log.node else "/tick"
         self.unreadable = ""
         """Why no chunk could be read at all."""
 
@@ -159,7 +174,7 @@ class _Pass:
         try:
             if raw.opcode == Opcode.ATTACHMENT:
                 name, data = parse_attachment(raw.content)
-                self.log.attachments[name] = data.decode(errors="replace")
+                self._keep(self.log.attachments, name, data.decode(errors="replace"))
             elif raw.opcode == MESSAGE:
                 yield from self._chunk(raw.content)
             elif content is not None:
@@ -181,9 +196,22 @@ class _Pass:
             with contextlib.suppress(DamagedError):
                 if raw.opcode == Opcode.ATTACHMENT:
                     name, data = parse_attachment(raw.content)
-                    self.log.attachments.setdefault(name, data.decode(errors="replace"))
+                    self._keep(self.log.attachments, name, data.decode(errors="replace"), again=False)
                 elif isinstance(record := parse(raw.opcode, raw.content), Metadata):
-                    self.log.metadata.setdefault(record.name, dict(record.metadata))
+                    self._keep(self.log.metadata, record.name, dict(record.metadata), again=False)
+
+    def _keep(self, kept: dict[str, Any], name: str, value: Any, *, again: bool = True) -> None:
+        """Keep an attachment or metadata; what is there stays unless ``again``.
+
+        What a node calls its own stands in the place of the first node's, whichever comes first.
+        """
+        own = name.removesuffix(f" of {self.log.node}") if self.log.node else name
+        if own != name:
+            self._owned.add((id(kept), own))
+        elif (id(kept), own) in self._owned:
+            return
+        if again or own != name or own not in kept:
+            kept[own] = value
 
     def _define(self, record: McapRecord) -> None:
         if isinstance(record, Header):
@@ -193,7 +221,7 @@ class _Pass:
         elif isinstance(record, Channel):
             self._channel(record)
         elif isinstance(record, Metadata):
-            self.log.metadata[record.name] = dict(record.metadata)
+            self._keep(self.log.metadata, record.name, dict(record.metadata))
             if record.name == "run":
                 check_format(self.log.path, record.metadata)
         elif isinstance(record, Statistics):
@@ -212,20 +240,21 @@ class _Pass:
         """Learn a channel; a topic of ours with another schema is another program's or version's."""
         if self._named.setdefault(channel.id, channel.topic) != channel.topic:
             self.problems.append(f"channel {channel.id} has two topics")
-        name, schema = TOPICS.get(channel.topic), self._schemas.get(channel.schema_id)
-        if name is None:
+        topic = "/tick" if channel.topic == self._tick_topic else channel.topic
+        name, schema = TOPICS.get(topic), self._schemas.get(channel.schema_id)
+        if name is None or (self.log.node and channel.topic == "/tick"):
             return
         if schema is None or schema.name != name or channel.message_encoding != "protobuf":
             raise LogError(
                 f"{self.log.path}: topic {channel.topic} has not the schema {name}; not a log of hil"
             )
-        if channel.topic == "/tick":
+        if topic == "/tick":
             self._learn(schema, channel.id)
         elif name != "hil.Stats" and message_layout(schema.data, name) != message_layout(_OWN, name):
             raise LogError(
                 f"{self.log.path}: {name} has another layout than format {FORMAT}; not a log of hil"
             )
-        self._topics[channel.id] = channel.topic
+        self._topics[channel.id] = topic
 
     def _learn(self, schema: Schema, channel: int) -> None:
         """How this file's ticks are laid out."""
@@ -378,13 +407,16 @@ def _read_parts(log: Log) -> Iterator[Block]:
     log.damage = "; ".join(damages) or None
 
 
-def new_log(source: Source) -> Log:
-    """A log to be read from one file, or from the parts of a split run. Raises LogError for none there."""
+def new_log(source: Source, node: str = "") -> Log:
+    """A log to be read from one file, or from the parts of a split run; ``node``: see :class:`Log`.
+
+    Raises LogError for none there.
+    """
     paths = (source,) if isinstance(source, Path) else tuple(source)
     for path in paths:
         if not path.is_file():
             raise LogError(f"{path}: no such file")
-    return Log(paths[0], new_ticks(0), parts=paths if len(paths) > 1 else ())
+    return Log(paths[0], new_ticks(0), parts=paths if len(paths) > 1 else (), node=node)
 
 
 def _read_file(log: Log) -> Iterator[Block]:
@@ -403,10 +435,17 @@ def _read_file(log: Log) -> Iterator[Block]:
         raise LogError(
             f"{log.path}: is no log of hil ({'; '.join(one.problems) or 'it has no run metadata'})"
         )
+    if log.node and log.node not in log.nodes:
+        raise LogError(f"{log.path}: has no node {log.node!r:.40}; {_named(log.nodes)}")
     if one.unreadable and not one.messages_seen:
         raise LogError(f"{log.path}: {one.unreadable}; rewrite it with zstd, lz4 or none")
     if one.problems:
         log.damage = _damage(log, one)
+
+
+def _named(nodes: Sequence[str]) -> str:
+    """Which nodes there are."""
+    return f"it has {' and '.join(nodes)}" if nodes else "it is of one drive: leave the node out"
 
 
 def _damage(log: Log, one: _Pass) -> str:
@@ -470,12 +509,19 @@ class _Kept:
         return out.view(TICK)
 
 
-def open_log(source: Source | str, *, frames: bool = True) -> Log:
-    """Read a log up to and around its damage. Raises LogError for what is no log of hil at all."""
-    log = new_log(Path(source) if isinstance(source, str) else source)
+def open_log(source: Source | str, *, frames: bool = True, node: str = "") -> Log:
+    """Read a log up to and around its damage. Raises LogError for what is no log of hil at all.
+
+    ``node``: of a run with several nodes the one to read; empty: the first.
+    """
+    log = new_log(Path(source) if isinstance(source, str) else source, node)
     kept = _Kept(log.path)
     for block in read_blocks(log):
         if block.kind == "ticks" or frames:
             kept.add(block)
+    if node and log.nodes[0] == node:  # its ticks are those of /tick
+        log = open_log(source, frames=frames)
+        log.node = node
+        return log
     log.ticks, log.frames = kept.joined(), kept.frames
     return log

@@ -93,11 +93,16 @@ class Recorder:
     :meth:`await_open` has returned.
     """
 
-    def __init__(self, path: Path, header: dict[str, Any] | None, rate_hz: int) -> None:
+    def __init__(self, path: Path, header: dict[str, Any] | None, rate_hz: int, nodes: int = 1) -> None:
+        """``nodes``: how many nodes on the bus have ticks; the header names those after the first."""
         self.path = path
         self._ticks = Ring.create("ticks", TICK.itemsize, rate_hz * RING_SECONDS)
         self._frames = Ring.create("frames", FRAME_RECORD.size, rate_hz * RING_SECONDS * FRAMES_PER_TICK)
         self._events = Ring.create("events", EVENT_BYTES, 1024)
+        more = range(1, nodes)
+        self._more = [Ring.create(f"ticks-{i}", TICK.itemsize, rate_hz * RING_SECONDS) for i in more]
+        self._more_records = [new_ticks() for _ in more]
+        self._more_push = [pusher(*both) for both in zip(self._more, self._more_records, strict=True)]
         self._failed = self._closed = self._begun = False
         self._looks = 0
         self._beat, self._beat_ns, self._look_ns = 0, time.monotonic_ns(), 0
@@ -112,7 +117,7 @@ class Recorder:
         self._say({"path": str(self.path), "header": header, "chunk_bytes": CHUNK_BYTES})
 
     def _spawn(self) -> subprocess.Popen[bytes]:
-        fds = [ring.fd for ring in (self._ticks, self._frames, self._events)]
+        fds = [ring.fd for ring in self._rings]
         return subprocess.Popen(
             [sys.executable, "-m", "hil.log.writer", *map(str, fds)],
             stdin=subprocess.PIPE,
@@ -136,6 +141,10 @@ class Recorder:
         with contextlib.suppress(BrokenPipeError):
             self._writer.stdin.write(json.dumps(what).encode() + b"\n")
             self._writer.stdin.flush()
+
+    @property
+    def _rings(self) -> tuple[Ring, ...]:
+        return (self._ticks, self._frames, self._events, *self._more)
 
     @property
     def writer_pid(self) -> int:
@@ -184,6 +193,16 @@ class Recorder:
         ticks, more = (ring_places(ring, records.view(np.uint8)) for ring, records in both)
         return ticks, more
 
+    @property
+    def more_records(self) -> list[TickArray]:
+        """The records of the nodes after the first, which :meth:`more_ticks` stores."""
+        return self._more_records
+
+    def more_ticks(self) -> None:
+        """Store the tick of each node after the first."""
+        for push in self._more_push:
+            push()
+
     def _attach(self, record: TickArray) -> None:
         """Be ready to store this very record."""
         self._record, self._push = record, pusher(self._ticks, record)
@@ -199,7 +218,7 @@ class Recorder:
     @property
     def dropped(self) -> int:
         """Ticks that the ring had no room for."""
-        return self._dropped if self._closed else self._ticks.dropped
+        return self._dropped if self._closed else sum(ring.dropped for ring in (self._ticks, *self._more))
 
     def close(self, result: dict[str, Any]) -> bool:
         """Hand over the result, wait for the writer; True when the file is complete."""
@@ -238,7 +257,8 @@ class Recorder:
         return code
 
     def _release(self) -> None:
-        self._dropped, self._closed = self._ticks.dropped, True
+        self._dropped, self._closed = self.dropped, True
         self._push = refuse
-        for ring in (self._ticks, self._frames, self._events):
+        self._more_push = [refuse for _ in self._more]
+        for ring in self._rings:
             ring.close()

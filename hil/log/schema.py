@@ -27,6 +27,13 @@ TOPICS: Final = {
     "/event": "hil.Event",
     "/stats": "hil.Stats",
 }
+
+
+def node_topic(node: str) -> str:
+    """Where the ticks of a second node on the bus go; those of the first go to ``/tick``."""
+    return f"/tick/{node}"
+
+
 FRAME: Final = np.dtype(
     [("t_ns", "<i8"), ("can_id", "<u4"), ("received", "u1"), ("size", "u1"), ("data", "u1", (64,))]
 )

@@ -1,6 +1,7 @@
 """The writer process: drains the rings of a controller into one MCAP file, whatever happens to it.
 
-Started by :mod:`hil.log.recorder` as ``python -m hil.log.writer FD FD FD``. Its standard input brings one
+Started by :mod:`hil.log.recorder` as ``python -m hil.log.writer FD FD FD``, with one FD more for each further
+node on the bus. Its standard input brings one
 JSON line with the file's path and header, later one with the result; end of file there means that the
 controller is gone. A write error sets a flag in the ring that the loop reads every tick.
 """
@@ -14,6 +15,7 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +34,8 @@ CHUNK_S: Final = 0.04
 STATS_S: Final = 1.0
 NICE: Final = 10
 Rings = tuple[Ring, Ring, Ring]
+Nodes = dict[str, Ring]
+"""The ticks of further nodes on the bus, by name."""
 
 
 class Every:
@@ -53,9 +57,9 @@ class Every:
 class Drain:
     """Rings in, file out."""
 
-    def __init__(self, rings: Rings, file: RunFile | SplitFile) -> None:
+    def __init__(self, rings: Rings, file: RunFile | SplitFile, nodes: Nodes) -> None:
         self._ticks, self._frames, self._events = rings
-        self._file = file
+        self._file, self._nodes = file, nodes
         self._t_ns: int | None = None
         self._lateness: list[np.ndarray[Any, np.dtype[np.int32]]] = []
 
@@ -68,6 +72,9 @@ class Drain:
             self._file.add_ticks(ticks)
             self._t_ns = int(ticks["t_ns"][-1])
             self._lateness.append(ticks["lateness_ns"])
+        for node, ring in self._nodes.items():
+            assert isinstance(self._file, RunFile)  # noqa: S101 - a log of several nodes is one file
+            self._file.add_ticks(np.frombuffer(ring.take(final=final), TICK), node)
         raw = self._events.take(final=final)
         for at in range(0, len(raw), EVENT_BYTES):
             self._event(raw[at : at + EVENT_BYTES])
@@ -103,7 +110,7 @@ class Drain:
     def losses(self) -> dict[str, int]:
         """Records dropped per ring."""
         return {
-            "dropped_ticks": self._ticks.dropped,
+            "dropped_ticks": sum(ring.dropped for ring in (self._ticks, *self._nodes.values())),
             "dropped_frames": self._frames.dropped,
             "dropped_events": self._events.dropped,
         }
@@ -129,9 +136,11 @@ def read_opening() -> tuple[dict[str, Any], bytes] | None:
     return opening, rest
 
 
-def serve(rings: Rings, file: RunFile | SplitFile, path: Path, control: bytes) -> dict[str, Any]:
+def serve(
+    rings: Rings, file: RunFile | SplitFile, path: Path, control: bytes, nodes: Nodes
+) -> dict[str, Any]:
     """Drain until standard input ends; return the result that the controller sent, if any."""
-    drain, header = Drain(rings, file), rings[0].header
+    drain, header = Drain(rings, file, nodes), rings[0].header
     chunk, stats = Every(CHUNK_S), Every(STATS_S)
     while (more := read_available(DRAIN_S)) is not None:
         control += more
@@ -163,7 +172,7 @@ def main() -> int:
     came = read_opening()
     if came is None:
         return 1
-    return write_run(rings, *came)
+    return write_run(rings, *came, [Ring(int(fd)) for fd in sys.argv[4:]])
 
 
 def _follower(header: dict[str, Any]) -> Follower:
@@ -173,7 +182,7 @@ def _follower(header: dict[str, Any]) -> Follower:
     return StateFollower(header)
 
 
-def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
+def write_run(rings: Rings, opening: dict[str, Any], control: bytes, more: Sequence[Ring] = ()) -> int:
     """Write the file that ``opening`` names; 0 when it is complete."""
     header, file, path = rings[0].header, None, Path(opening["path"])
     try:
@@ -181,7 +190,8 @@ def write_run(rings: Rings, opening: dict[str, Any], control: bytes) -> int:
         header[BEAT_AT] += 1
         with contextlib.suppress(BrokenPipeError):  # a controller that was killed: its records are kept
             os.write(1, b"ready\n")
-        file.finish(serve(rings, file, path, control))
+        nodes = dict(zip(opening["header"].get("nodes", []), more, strict=True))
+        file.finish(serve(rings, file, path, control, nodes))
         file.check_place(path)
     except OSError as error:
         header[FAILED_AT] = 1

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from hil.errors import HilError
-from hil.manual.schema import FILES, Schema, schema_of
+from hil.manual.schema import FILES, NODES, Schema, schema_of
 
 BEFORE: Final = {"run": "", "plant": "plant:", "faults": "faults:", "campaign": "campaign:"}
 """What stands before a key that is of another file than the run's, as in a campaign's plan."""
@@ -96,9 +96,9 @@ def _walk(schema: Schema, node: Schema, file: str, key: str, many: bool) -> Iter
     """The table ``node`` that is called ``key``, and those in it."""
     kind = node["properties"].get("kind", {}).get("const")
     table = Table(file, key.rstrip("."), kind, many, node.get("description", ""))
-    inner = []
+    inner, needed = [], (*node.get("required", ()), *node.get("then", {}).get("required", ()))
     for name, given in node["properties"].items():
-        one = _key(name, given, name in node.get("required", ()), table)
+        one = _key(name, given, name in needed, table)
         members, is_list = _members(schema, given)
         if members:
             inner += [_walk(schema, member, file, f"{key}{name}.", is_list) for member in members]
@@ -117,7 +117,8 @@ def _members(schema: Schema, given: Schema) -> tuple[list[Schema], bool]:
         return _members(schema, given.get("items", {}))[0], True
     if "properties" in given:
         return [given], False
-    found = [_members(schema, one) for one in (*given.get("oneOf", ()), *given.get("anyOf", ()))]
+    several = (*given.get("oneOf", ()), *given.get("anyOf", ()))
+    found = [_members(schema, one) for one in several if NODES not in one]
     out: list[Schema] = []
     for members, _ in found:
         out += [member for member in members if member not in out]

@@ -22,6 +22,7 @@ import hil.config.tables
 from drivers.mapping import NO_KEYS, DriveMap
 from firmware_model.config import PlantConfig
 from hil.campaign.plan import CovarianceTable, PlanTable
+from hil.config.nodes import MOST, NAME, OWN
 from hil.config.tables import RunConfig, models_in
 from hil.faults.matrix import Expect, Matrix
 from hil.manual.units import unit_of
@@ -37,6 +38,8 @@ INCLUDED: Final = (hil.config.tables.included, firmware_model.config.included)
 """What lets a table be the path of a file that holds it."""
 USUAL: Final = ("ftdob", "cascade")
 """Kinds that a table may leave out."""
+NODES: Final = "x-nodes"
+"""Marks what says a table's keys once more, for a list of nodes."""
 Schema = dict[str, Any]
 
 
@@ -144,12 +147,32 @@ def _open(schema: Schema, file: str) -> None:
         signals |= _map_schema() | {"description": signals["description"]}
         expect = schema["$defs"]["FaultsTable"]["properties"]["expect"]
         expect["additionalProperties"] = _table(Expect)
+        _open_nodes(schema)
     if file == "faults":
         schema["$defs"]["Row"]["properties"]["fault"]["items"] = {"type": "object", "required": ["kind"]}
     if file == "campaign":
         group = _table(CovarianceTable)
         covariance = schema["properties"]["covariance"]
         covariance |= {"anyOf": [group, {"type": "array", "items": group}]}
+
+
+def _open_nodes(schema: Schema) -> None:
+    """``[[drive]]``: a list of nodes, each with the tables that else stand at the top."""
+    drive, given = schema["$defs"]["DriveTable"], schema["properties"]
+    name = {"type": "string", "pattern": f"^{NAME.pattern}$", "description": "What the node is called."}
+    node = {
+        "type": "object",
+        "description": "A node of several on one bus (docs/two-nodes.md).",
+        "properties": {"name": name} | drive["properties"] | {own: given[own] for own in OWN},
+        "required": ["name", "dbc"],
+        "additionalProperties": False,
+    }
+    nodes = {"type": "array", "items": node, "minItems": MOST, "maxItems": MOST, NODES: True}
+    given["drive"] = {"anyOf": [given["drive"], nodes]}
+    needed = [key for key in schema["required"] if key != "drive"]
+    schema["required"] = ["drive"]
+    schema["if"] = {"properties": {"drive": {"type": "object"}}}
+    schema["then"] = {"required": needed}
 
 
 def _table(model: type[BaseModel]) -> Schema:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -205,12 +205,26 @@ def tick_blocks(log: Log) -> Iterator[TickArray]:
 def replay(
     source: Source, window: Window | None = None, seen: Callable[[int], None] | None = None
 ) -> Verdict:
-    """Replay a file; what can't be replayed is a verdict, not an exception.
+    """Replay a file, of a run with several nodes each; what can't be replayed is a verdict, not an exception.
 
     ``seen`` is told after each block how many ticks are done.
     """
     try:
         log = new_log(source)
-        return _run(Replay(log, window or WHOLE), read_blocks(log), seen or (lambda _: None))
+        verdict = _run(Replay(log, window or WHOLE), read_blocks(log), seen or (lambda _: None))
+        return _each(source, window or WHOLE, log.nodes, verdict) if log.nodes else verdict
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))
+
+
+def _each(source: Source, window: Window, nodes: Sequence[str], first: Verdict) -> Verdict:
+    """The worst verdict of all nodes, and each by its name."""
+    found = {nodes[0]: first}
+    for node in nodes[1:]:
+        log = new_log(source, node)
+        found[node] = _run(Replay(log, window), read_blocks(log), lambda _: None)
+    name, worst = max(found.items(), key=lambda pair: pair[1].exit_code)
+    why = f"{name}: {worst.why}" if worst.why else ""
+    if worst.verdict == "differs" and not why:
+        why = f"node {name}"
+    return dataclasses.replace(worst, why=why, nodes=found)

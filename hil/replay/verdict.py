@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +29,8 @@ class Verdict:
     why: str = ""
     notes: tuple[str, ...] = ()
     """What another version's log lacks or this version would do otherwise, and what was taken for it."""
+    nodes: dict[str, Verdict] = field(default_factory=dict)
+    """Of a run with several nodes each one's; the worst is the run's."""
 
     @property
     def exit_code(self) -> int:
@@ -45,6 +47,8 @@ class Verdict:
             "why": self.why,
             "notes": list(self.notes),
         }
+        if self.nodes:
+            out["nodes"] = {name: verdict.as_dict() for name, verdict in self.nodes.items()}
         if first is not None:
             out["first_difference"] = {
                 "tick": first.tick,

@@ -77,6 +77,7 @@ def demo_table(result: dict[str, Any]) -> Table:
         or "nothing asked (lockstep)",
         "ended": result["ended"] + (f" in lockstep: {result['too_slow']}" if result.get("too_slow") else ""),
         **end_rows(result["end"]),
+        **node_rows(result.get("nodes", {})),
         "replay": verdict_text(replay),
         "log": result["log"],
     }
@@ -94,6 +95,7 @@ def verdict_text(replay: dict[str, Any]) -> str:
             f" from tick {first['tick']} on: {first['field']} logged {first['logged']}, "
             f"replayed {first['replayed']} ({first['ulp']} ulp)"
         )
+    text += f" ({', '.join(replay['nodes'])})" if "nodes" in replay else ""
     return "; ".join([text, *([replay["why"]] if replay["why"] else []), *replay.get("notes", ())])
 
 
@@ -104,11 +106,17 @@ def end_rows(end: dict[str, Any] | None) -> dict[str, str]:
     return {"why": end["text"], "what to do": end["remedy"]}
 
 
+def node_rows(nodes: dict[str, Any]) -> dict[str, str]:
+    """How each node of a run with several ended."""
+    return {f"node {name}": node["ended"].replace("_", " ") for name, node in nodes.items()}
+
+
 def run_table(result: RunResult) -> Table:
     """What a run says at its end."""
     rows: dict[str, Any] = {
         "ended": Reason(result.outcome.reason).name.lower().replace("_", " "),
         **end_rows(result.end.as_dict() if result.end else None),
+        **node_rows(result.nodes),
         "ticks": f"{result.outcome.ticks}, {result.outcome.skipped} skipped",
         "records dropped": result.dropped,
     }

@@ -7,7 +7,7 @@ import os
 import select
 import termios
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TextIO
 
 from hil.config.tables import RunConfig
@@ -40,13 +40,13 @@ def summary(config: RunConfig) -> str:
     )
 
 
-def confirm(config: RunConfig, asking: TextIO, telling: TextIO) -> None:
+def confirm(configs: Sequence[RunConfig], asking: TextIO, telling: TextIO) -> None:
     """Ask a person on a terminal; anything but ``yes`` raises ArmingError, and so does no terminal."""
     if not asking.isatty():
         raise ArmingError(
             "not armed: standard input is no terminal to ask on; nothing was sent; --yes arms without asking"
         )
-    telling.write(summary(config) + "\ntype yes to arm: ")
+    telling.write("\n".join(map(summary, configs)) + "\ntype yes to arm: ")
     telling.flush()
     if asking.readline().strip().lower() != "yes":
         raise ArmingError("not armed: the answer was not yes; nothing was sent")

@@ -128,12 +128,8 @@ def new_client(
 ) -> BusDrive:
     """A drive client on a link of its own; one that ``controls`` may have SYNC by the kernel."""
     load = setup.config.controller.kind == "fac"
-    link: Link = open_link(bus_settings(setup.config))
-    if setup.config.loop.clock == "lockstep":
-        sync = setup.binding.opener
-        link = LockstepLink(link, sync.send_id if sync else None)
     return drive_kind(setup.config.drive.kind).open(
-        link,
+        opened_link(setup),
         setup.database,
         load=load,
         drive_map=setup.binding.map,
@@ -141,6 +137,15 @@ def new_client(
         now=now,
         timed=sync_by_kernel(setup) if controls else None,
     )
+
+
+def opened_link(setup: Setup) -> Link:
+    """The configured bus, opened; in lockstep it knows the end of a tick."""
+    link: Link = open_link(bus_settings(setup.config))
+    if setup.config.loop.clock == "lockstep":
+        sync = setup.binding.opener
+        link = LockstepLink(link, sync.send_id if sync else None)
+    return link
 
 
 def sync_by_kernel(setup: Setup) -> KernelSync | None:

@@ -237,13 +237,15 @@ def _serve(
 
 
 @contextlib.contextmanager
-def guardian(timeout_ns: int, rights: Rights, open_stopper: Callable[[], Stopper]) -> Iterator[Words]:
+def guardian(
+    timeout_ns: int, rights: Rights, open_stopper: Callable[[], Stopper], words: Words | None = None
+) -> Iterator[Words]:
     """A guardian while the block runs, which must be in the thread that runs the loop.
 
     ``open_stopper`` runs in the guardian and opens a link of its own; it lets go of what a fork must not keep
     open, the recorder's pipes. Raises HilError when it can't start.
     """
-    words, parent = Words(), os.getpid()
+    words, parent = words or Words(), os.getpid()
     words.lifeline.hold()
     ours, theirs = os.pipe()
     pid = os.fork()

@@ -56,6 +56,8 @@ class RunResult:
     """Processor time of the loop's thread, per tick [us]."""
     end: End | None = None
     """Why it ended; None when it did not get so far."""
+    nodes: dict[str, Any] = field(default_factory=dict)
+    """Of a run with several nodes how each ended, by name; ``outcome`` and ``end`` are then its cause's."""
 
     @property
     def ok(self) -> bool:
@@ -76,7 +78,7 @@ class RunResult:
             "processor_us": self.processor_us,
             "grants": [asdict(grant) for grant in self.grants],
             "ok": self.ok,
-        }
+        } | ({"nodes": self.nodes} if self.nodes else {})
 
 
 def compile_kernels(setup: Setup) -> None:
@@ -98,7 +100,7 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
-    with _alone(setup), _writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
+    with _alone(setup), writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
         compile_kernels(setup)  # while the writer starts
         check_set_up(setup)
         with _guarding(setup, recorder) as words:
@@ -106,7 +108,7 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
 
 
 @contextlib.contextmanager
-def _writing(recorder: Recorder) -> Iterator[Recorder]:
+def writing(recorder: Recorder) -> Iterator[Recorder]:
     """A log that says of a run that was refused why."""
     try:
         yield recorder
@@ -161,12 +163,12 @@ def _recorded(
         recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
         asked = not watch and drive_kind(config.drive.kind).asked
         if asked:  # who asks has listened
-            _hear_others(setup, client)
+            hear_others(setup, client)
         if watch or not setup.binding.map.poll:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
-            _await_drive(setup, client, asked)
+            await_drive(setup, client, asked)
         if not (watch or asked):
-            _hear_others(setup, client)
+            hear_others(setup, client)
         recorder.await_open()
         say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
         drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
@@ -207,7 +209,7 @@ def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
     return ranges(setup.machine, config.controller.kind)
 
 
-def _await_drive(setup: Setup, client: BusDrive, ask: bool = False) -> None:
+def await_drive(setup: Setup, client: BusDrive, ask: bool = False) -> None:
     """Listen for the drive before anything is sent; ``ask``: for what it measures, which commands nothing."""
     timeout_s = setup.config.drive.heartbeat_timeout_s
     if not client.wait_for_drive(timeout_s, ask):
@@ -225,7 +227,7 @@ def _await_drive(setup: Setup, client: BusDrive, ask: bool = False) -> None:
         raise ArmingError(f"{odd}; correct the DBC, or the drive's mapping; nothing was sent")
 
 
-def _hear_others(setup: Setup, client: BusDrive) -> None:
+def hear_others(setup: Setup, client: BusDrive) -> None:
     """Listen for another controller, on this machine or not, before anything is sent. Raises ArmingError."""
     heard = client.other_master(max(LISTEN_PERIODS * setup.config.loop.period_ns * 1e-9, LISTEN_S))
     if heard is not None:

@@ -16,15 +16,18 @@ import numpy as np
 
 from firmware_model.config import PlantMotor
 from hil.config.design import law_spec, motor_model
+from hil.config.nodefile import load_nodes
 from hil.config.shipped import find_config
 from hil.config.tables import RunConfig
 from hil.control.law import MotorModel, exact_after, law_window, sampled_model
 from hil.control.observer import Window, bounds, impulse_response, response_length
 from hil.errors import HilError
 from hil.log.reader import Log, open_log
-from hil.replay import Verdict, replay_log
+from hil.replay import Verdict, replay, replay_log
 from hil.report.metrics import Lateness, LoadStep, load_step, tracking_rms
 from hil.runtime.bus import bus_settings
+from hil.runtime.nodesession import run_nodes
+from hil.runtime.nodesetup import Nodes, load_node_setups
 from hil.runtime.progress import say
 from hil.runtime.session import RunResult, run
 from hil.runtime.setup import Overrides, Setup, load_setup
@@ -164,9 +167,39 @@ def in_lockstep(overrides: Overrides, setup: Setup) -> Overrides:
     return replace(overrides, settings=(*overrides.settings, *own))
 
 
+def nodes_loop(path: Path, overrides: Overrides) -> tuple[Nodes, RunResult, Log]:
+    """:func:`closed_loop` for several nodes on one emulated shaft."""
+    if overrides.channel is None:
+        overrides = replace(overrides, channel=own_channel("demo"))
+    setups = load_node_setups(path, overrides)
+    assert setups is not None  # noqa: S101 - asked for by who knows that there are several
+    with emulator_process(path, overrides):
+        for setup in setups.values():
+            if setup.config.canopen is not None:
+                set_up(path, setup.config)
+        result = run_nodes(setups)
+    return setups, result, open_log(Path(result.log))
+
+
+def demo_nodes(path: Path, overrides: Overrides) -> dict[str, Any]:
+    """:func:`demo` of several nodes: what the first one did, how each ended, and whether all replay."""
+    setups, result, log = nodes_loop(path, overrides)
+    setup = next(iter(setups.values()))
+    if slow := too_slow(setup, result, log):
+        say(f"{slow}; going on in lockstep: the same loop and drives, without real time")
+        setups, result, log = nodes_loop(path, in_lockstep(overrides, setup))
+        setup = next(iter(setups.values()))
+    plants = [load_plant(path, one.config)[0].motor for one in setups.values()]
+    true = replace(true_motor(plants[0]), J=sum(motor.J_kg_m2 for motor in plants))
+    shown = summary(setup, log.ticks, result, replay(Path(result.log)), true)
+    return shown | {"clock": setup.config.loop.clock, "too_slow": slow, "nodes": result.nodes}
+
+
 def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
     """Run the demo, in lockstep where the host can't hold its rate; raises HilError with one clear line."""
     path = path or find_config("demo.toml")
+    if load_nodes(path, overrides.as_settings()):
+        return demo_nodes(path, overrides)
     setup, result, log = closed_loop(path, overrides)
     slow = too_slow(setup, result, log) if setup.binding.opener else ""
     if slow:

@@ -10,10 +10,13 @@ from drivers.binding import bind
 from drivers.bus import Link, open_link
 from drivers.codec import Database
 from drivers.mapping import MEASURED
+from firmware_model.bench import Bench, Coupled
 from firmware_model.config import PlantConfig, build_params, new_state
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults
 from firmware_model.node import Node, compile_kernels, frames_of, wire_of
+from firmware_model.shaft import refuse_uncoupled
+from hil.config.nodefile import load_nodes
 from hil.config.tables import RunConfig, load_toml
 from hil.errors import ConfigError
 from hil.runtime import realtime
@@ -70,6 +73,39 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
     return node, faulty or link, what
 
 
+def make_bench(path: Path, nodes: dict[str, RunConfig], plant_settings: list[str]) -> tuple[Bench, Link, str]:
+    """:func:`make_node` for two drives on one shaft; the settings of a plant are for both."""
+    plants = {name: load_plant(path, config, plant_settings) for name, config in nodes.items()}
+    refuse_uncoupled({name: plant for name, (plant, _) in plants.items()})
+    config = next(iter(nodes.values()))
+    made, bus, link = [], config.bus, open_link(bus_settings(config))
+    for name, (plant, folder) in plants.items():
+        own = nodes[name].drive
+        if plant.node_id != own.node_id:
+            link.close()
+            raise ConfigError(
+                f"{path}: node {name}",
+                [f"emulator.plant: node {plant.node_id} is emulated, drive.node_id is {own.node_id}"],
+            )
+        database = Database(folder / plant.dbc, plant.node_id, own.node_rule)
+        made.append(
+            Coupled(
+                link,
+                database,
+                build_params(plant, wire_of(database, plant.protocol)),
+                clock=config.loop.clock,
+                pacing="sync",
+                period_ns=config.loop.period_ns,
+                truth=plant.truth,
+                protocol=plant.protocol,
+                eds=folder / plant.eds if plant.eds else None,
+            )
+        )
+    shown = " and ".join(f"{name} (node {plant.node_id})" for name, (plant, _) in plants.items())
+    what = f"{bus.interface}:{bus.channel}, {shown} on one shaft, {config.loop.clock}"
+    return Bench(link, made), link, what
+
+
 def check_spoken(path: Path, config: RunConfig, spoken: dict[int, int]) -> None:
     """Refuse an emulated drive that does not speak what the run maps. Raises ConfigError.
 
@@ -103,6 +139,12 @@ def warm_up(path: Path, config: RunConfig) -> None:
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
     """Run the emulator until SIGINT or SIGTERM. Prints one line when it listens and one at the end."""
+    if nodes := load_nodes(path, overrides.as_settings()):
+        config = next(iter(nodes.values()))
+        names = [f"node {one.drive.node_id}" for one in nodes.values()]
+        with claimed(config.bus.interface, config.bus.channel, names):
+            _serve(config, *make_bench(path, nodes, plant_settings))
+        return
     config = load_toml(path, RunConfig, overrides.as_settings())
     plant, _ = load_plant(path, config, plant_settings)
     node_name, bus = f"node {plant.node_id}", config.bus
@@ -110,7 +152,7 @@ def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:
         _serve(config, *make_node(path, config, plant_settings))
 
 
-def _serve(config: RunConfig, node: Node, link: Link, what: str) -> None:
+def _serve(config: RunConfig, node: Node | Bench, link: Link, what: str) -> None:
     node.warm_up()
     if config.loop.clock == "realtime":
         below = config.realtime.model_copy(

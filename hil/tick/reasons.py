@@ -235,6 +235,9 @@ CAUSES: Final[dict[Reason, Cause]] = {
         "a slow message of the drive (DC link, temperatures) stopped or never came",
         "look at what the drive sends; status_timeout_s or GenMsgCycleTime in the DBC say how long to wait",
         "feedback.status_timeout_s", "s", _age, _age_max, _never_came),
+    Reason.NODE_STOPPED: Cause(
+        "another node of this run stopped, and all stop with it",
+        "look at why the other one stopped: hil replay LOG and hil report LOG name it", fault=False),
 }  # fmt: skip
 
 

@@ -176,11 +176,13 @@ def judge(p: Any, s: Any, t: Any) -> int:
 
 @jit
 def judge_request(t: Any) -> int:
-    """Return the Reason that the operator's request gives."""
+    """Return the Reason that the request gives: the operator's, or for the sake of another node."""
     if t["request"] == Request.QUICK_STOP:
         return Reason.QUICK_STOP_REQUESTED.value
     if t["request"] == Request.STOP:
         return Reason.STOP_REQUESTED.value
+    if t["request"] == Request.NODE_STOPPED:
+        return Reason.NODE_STOPPED.value
     return Reason.NONE.value
 
 
@@ -192,6 +194,7 @@ def is_fault(reason: int) -> bool:
         or reason == Reason.QUICK_STOP_REQUESTED
         or reason == Reason.STALE_FEEDBACK
         or reason == Reason.LOG_FAILED
+        or reason == Reason.NODE_STOPPED
     )
 
 

@@ -12,7 +12,15 @@ from tests.conftest import ROOT
 PACKAGES = ("hil", "drivers", "firmware_model")
 STDLIB_OK = {"hashlib", "os", "pathlib", "__future__", "collections", "dataclasses", "math", "typing", "enum"}
 STDLIB_OK |= {"cmath", "functools", "importlib", "sys"}
-ROOT_MODULES = ("runtime/setup", "runtime/bus", "runtime/header", "runtime/refusals", "runtime/session")
+ROOT_MODULES = (
+    "runtime/setup",
+    "runtime/bus",
+    "runtime/header",
+    "runtime/refusals",
+    "runtime/session",
+    "runtime/nodesession",
+    "runtime/nodesetup",
+)
 ROOT_MODULES += ("cli", "runtime/configure", "sim/emulate", "sim/simulate", "sim/demo", "check/checks")
 ROOT_MODULES += ("runtime/fused",)
 ROOT_MODULES += ("faults/case", "exchange/rerun", "campaign/case", "replay/frames", "replay/sent")
@@ -114,7 +122,18 @@ def test_a_room_imports_from_those_before_it(room: str) -> None:
 
 
 def test_nothing_reads_a_clock_but_the_places_that_may() -> None:
-    may = {"clock", "bus", "session", "simulate", "ring", "recorder", "writer", "preflight", "checks"}
+    may = {
+        "clock",
+        "bus",
+        "session",
+        "nodesession",
+        "simulate",
+        "ring",
+        "recorder",
+        "writer",
+        "preflight",
+        "checks",
+    }
     for path in files("hil"):
         figures = {"paper", "bench", "commands", "faults"} & set(path.parts)  # not control
         if path.stem in may or figures:

@@ -265,12 +265,18 @@ def test_the_first_of_two_reasons() -> None:
     assert [first(a, b) for a, b in ((0, 0), (0, 7), (5, 0), (5, 7), (1, 7))] == [0, 7, 5, 5, 1]
 
 
+ASKED = {
+    Request.STOP: Reason.STOP_REQUESTED,
+    Request.QUICK_STOP: Reason.QUICK_STOP_REQUESTED,
+    Request.NODE_STOPPED: Reason.NODE_STOPPED,
+}
+
+
 @pytest.mark.parametrize("request_", list(Request), ids=lambda request: request.name)
 def test_what_the_operator_asks(request_: Request) -> None:
     guard = bench()
     guard.t["request"] = int(request_)
-    asked = {Request.STOP: Reason.STOP_REQUESTED, Request.QUICK_STOP: Reason.QUICK_STOP_REQUESTED}
-    assert judge_request(guard.t) == asked.get(request_, Reason.NONE)
+    assert judge_request(guard.t) == ASKED.get(request_, Reason.NONE)
 
 
 CAUSES = (
@@ -337,6 +343,7 @@ def test_the_drive_is_judged_in_operation_alone() -> None:
 @pytest.mark.parametrize("reason", [r for r in Reason if r], ids=lambda reason: reason.name)
 def test_which_stops_are_faults(reason: Reason) -> None:
     planned = {Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED, Reason.STALE_FEEDBACK, Reason.LOG_FAILED}
+    planned |= {Reason.NODE_STOPPED}
     assert is_fault(int(reason)) is (reason not in planned)
     guard = bench()
     guard.s["stop_ticks"], guard.s["stale"], guard.s["stale_at"] = 7, 5, 2
@@ -543,8 +550,7 @@ DISARMED = int(DriveState.SWITCH_ON_DISABLED)
 def test_only_arm_arms(request_: Request) -> None:
     guard = bench()
     guard.s["state"], guard.t["request"], guard.t["drive_state"] = DISARMED, int(request_), DISARMED
-    stop = {Request.STOP: Reason.STOP_REQUESTED, Request.QUICK_STOP: Reason.QUICK_STOP_REQUESTED}
-    expected = (DISARMED, stop.get(request_, Reason.NONE), Controlword.DISABLE_VOLTAGE, 0)
+    expected = (DISARMED, ASKED.get(request_, Reason.NONE), Controlword.DISABLE_VOLTAGE, 0)
     assert tick(guard) == ((READY, 0, Controlword.SHUTDOWN, 1) if request_ == Request.ARM else expected)
 
 

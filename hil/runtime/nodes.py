@@ -1,0 +1,279 @@
+"""The tick of two nodes on one bus: one SYNC, then for each node read, judge, compute, write, record.
+
+A node is a whole controller: its records, law, guard and supervisor are those of a run of one drive, and so
+are the kernels. Here is what they share: time, SYNC, the guardian's words, and the rule that none drives on
+alone. When one leaves operation by a fault or a quick stop, the others are asked to stop in the same tick:
+their tick is computed once more, from the same state, with that request as its input.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, Protocol
+
+import numpy as np
+
+from hil.config.design import Machine
+from hil.log.recorder import Recorder
+from hil.ports import Clock, Inbox
+from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, GUARD_NS, Words, guardian_flags
+from hil.runtime.loop import (
+    BUS_DOWN,
+    ENDED,
+    FULL,
+    SEND_FAILED,
+    Cells,
+    Loop,
+    Outcome,
+    Plan,
+    StopRequest,
+    bounded,
+    transition_event,
+)
+from hil.runtime.trouble import TROUBLE, Trouble
+from hil.signals import ALL_MISSING, DriveState, Reason, Request, TickArray, cell, ticks_from
+
+COUNTERS: Final = GUARD_NS + 1
+"""Word of the first node's newest command counter; those of the others follow."""
+ALONE: Final = (int(Reason.NONE), int(Reason.STOP_REQUESTED), int(Reason.NODE_STOPPED))
+"""Reasons with which a node leaves the others as they are: each ends an orderly stop by its own ramp."""
+SHARED: Final = ("k", "t_ns", "gap", "skipped", "lateness_ns", "request", "log_failed")
+NODE_STOPPED: Final = int(Request.NODE_STOPPED)
+
+
+class Client(Protocol):
+    """What a tick asks of a node's client, :class:`drivers.client.DriveClient`."""
+
+    def prepare(self, tick: Any) -> None:
+        """Get ready for this very record."""
+
+    def sync(self, tick: Any) -> None:
+        """Send SYNC, for all nodes; what came before is taken as late."""
+
+    def follow(self, tick: Any) -> None:
+        """Take what came before another client's SYNC as late."""
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        """Wait for the node's measurements."""
+
+    def send(self, tick: Any) -> None:
+        """Send the tick's command. Raises OSError."""
+
+    def stop(self) -> None:
+        """Send the stop frames and leave; never raises."""
+
+    def flush(self) -> None:
+        """Hand on the frames that came and went."""
+
+    def odd_length(self) -> str:
+        """Which message came with another length than it should, in words."""
+
+    def close(self) -> None:
+        """Release the bus."""
+
+
+class Axis:
+    """One node: its client, controller and record."""
+
+    def __init__(self, name: str, client: Client, machine: Machine, ticks: TickArray) -> None:
+        self.name, self.client, self.machine, self.ticks = name, client, machine, ticks
+        self.tick: Any = ticks[0]
+        self.cells: Any = Cells(ticks)
+        self.counter: Any = cell(ticks, "counter")
+        self.step = machine.looped()
+        self.outcome = Outcome()
+        self.ended = False
+        self.noted = int(DriveState.SWITCH_ON_DISABLED)
+        states = (machine.safety_state, machine.law_state, machine.setpoint_state)
+        self._live = [state.view(np.uint8) for state in states]
+        self._kept = [live.copy() for live in self._live]
+        client.prepare(self.tick)
+
+    def begin(self, first: Any) -> None:
+        """Stamp the tick as the first node's."""
+        cells = self.cells
+        if cells is not first:
+            for name in SHARED:
+                getattr(cells, name)[0] = getattr(first, name)[0]
+        cells.rx_flags[0], cells.missing[0] = 0, ALL_MISSING
+
+    def decide(self) -> bool:
+        """Run the controller; True when the others must stop with it."""
+        for kept, live in zip(self._kept, self._live, strict=True):
+            kept[:] = live
+        self.step(self.ticks)
+        return self.cells.reason[0] not in ALONE
+
+    def stop_too(self) -> None:
+        """The same tick once more for a node that has no reason of its own: another one has."""
+        if self.cells.reason[0]:
+            return
+        for kept, live in zip(self._kept, self._live, strict=True):
+            live[:] = kept
+        self.cells.request[0] = NODE_STOPPED
+        self.step(self.ticks)
+
+    def conclude(self) -> None:
+        """Find out whether this node's run has ended."""
+        cells, outcome = self.cells, self.outcome
+        if cells.reason[0]:
+            if outcome.stop is None:
+                outcome.stop = ticks_from(self.ticks.tobytes())
+            outcome.state, outcome.reason = cells.state[0], cells.reason[0]
+            self.ended = cells.state[0] in ENDED
+
+
+class Together:
+    """The nodes as the one drive that a loop stops; each was prepared with its own record."""
+
+    def __init__(self, axes: Sequence[Axis], words: Any) -> None:
+        self._axes, self._words = axes, words
+
+    def prepare(self, tick: Any) -> None:
+        """Done by each node."""
+
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """SYNC once, then each node's feedback; nothing is sent once the guardian has fired."""
+        words, first = self._words, self._axes[0]
+        for axis in self._axes[1:]:
+            axis.client.follow(axis.tick)
+        if words is not None and words[FIRED]:
+            first.client.follow(first.tick)
+        else:
+            first.client.sync(first.tick)
+        for axis in self._axes:
+            self.listen(axis, deadline_ns)
+
+    def receive(self, tick: Any, deadline_ns: int) -> None:
+        """Each node's feedback."""
+        for axis in self._axes:
+            self.listen(axis, deadline_ns)
+
+    @staticmethod
+    def listen(axis: Axis, deadline_ns: int) -> None:
+        """One node's feedback; its frames are logged before the next node's."""
+        axis.client.receive(axis.tick, deadline_ns)
+        axis.client.flush()
+
+    def send(self, tick: Any) -> None:
+        """Each node sends its own command: see :class:`NodesLoop`."""
+
+    def stop(self) -> None:
+        """The stop frames of each node in the configuration's order; the guardian's stand."""
+        if self._words is None or not self._words[FIRED]:
+            for axis in self._axes:
+                axis.client.stop()
+        if self._words is not None:
+            self._words[ARMED] = 0
+
+    def close(self) -> None:
+        """Release the bus."""
+        for axis in reversed(self._axes):
+            axis.client.close()
+
+
+class NodesLoop(Loop):
+    """:class:`hil.runtime.loop.Loop` over several nodes; it ends when all have ended."""
+
+    def __init__(
+        self,
+        axes: Sequence[Axis],
+        clock: Clock,
+        recorder: Recorder,
+        plan: Plan,
+        request: StopRequest,
+        words: Words | None = None,
+        inbox: Inbox | None = None,
+    ) -> None:
+        self._axes, self._more, self._rings = axes, axes[1:], recorder
+        self._words: Any = words.cells if words else None
+        together, first = Together(axes, self._words), axes[0]
+        super().__init__(together, clock, recorder, first.step, first.ticks, plan, request, inbox=inbox)
+        self._troubles = [Trouble(self._teller(axis)) for axis in self._more]
+
+    def _teller(self, axis: Axis) -> Any:
+        """Events of a node after the first, with its name."""
+
+        def tell(t_ns: int, k: int, kind: str, text: str) -> None:
+            self._recorder.event(t_ns, k, kind, f"{axis.name}: {text}")
+
+        return tell
+
+    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int, begun: bool = False) -> int:
+        """A tick of all nodes, each of which has feedback in every tick."""
+        now, words = self._clock.now_ns, self._words
+        self._stamp(k, deadline_ns, gap, now_ns)
+        for axis in self._axes:
+            axis.begin(self._cells)
+        if words is not None:
+            words[BEAT_NS] = now()
+        self._exchange(tick, deadline_ns, True)
+        guarded = 0 if words is None else guardian_flags(words)
+        received_ns = bounded(now() - deadline_ns)
+        for axis in self._axes:
+            axis.cells.rx_flags[0] |= guarded
+            axis.cells.received_ns[0] = received_ns
+        self._decide()
+        computed_ns = bounded(now() - deadline_ns)
+        for axis in self._axes:
+            axis.cells.computed_ns[0] = computed_ns
+        self._answer(tick, deadline_ns)
+        self._note(k, deadline_ns)
+        return k
+
+    def _exchange(self, tick: Any, deadline_ns: int, due: bool) -> None:
+        """SYNC out and feedback in; a SYNC that is not out is told to all."""
+        try:
+            self._drive.exchange(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
+        except OSError as error:
+            for axis in self._axes:
+                axis.cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
+
+    def _decide(self) -> None:
+        """Each node's controller; once one has left by a fault or a quick stop, all stop in this tick."""
+        left = [axis.decide() for axis in self._axes]
+        if any(left):
+            for axis in self._axes:
+                axis.stop_too()
+
+    def _answer(self, tick: Any, deadline_ns: int) -> None:
+        """The commands, in the configuration's order, unless the guardian has stopped the drives."""
+        words, axes = self._words, self._axes
+        if words is not None:
+            words[BEAT_NS] = self._clock.now_ns()
+            for place, axis in enumerate(axes, COUNTERS):
+                words[place] = axis.counter[0]
+            words[ARMED] = any(axis.cells.state[0] != DISARMED for axis in axes)
+        for axis in axes:
+            if axis.cells.send[0]:
+                self._command(axis)
+            axis.cells.sent_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
+
+    def _command(self, axis: Axis) -> None:
+        """Send one node's command; a bus that does not take it is seen in the next tick."""
+        t, why = axis.cells, "the guardian has stopped the drive"
+        try:
+            if self._words is None or not self._words[FIRED]:
+                axis.client.send(axis.tick)
+                axis.client.flush()
+                return
+        except OSError as error:
+            why = str(error)
+        self._recorder.event(t.t_ns[0], t.k[0], "send-failed", f"{axis.name}: {why}")
+
+    def _note(self, k: int, deadline_ns: int) -> None:
+        """Log what is new of each node, then the records."""
+        super()._note(k, deadline_ns)
+        for axis, trouble in zip(self._more, self._troubles, strict=True):
+            cells = axis.cells
+            if cells.rx_flags[0] & TROUBLE:
+                trouble.note(deadline_ns, k, cells.rx_flags[0])
+            if cells.state[0] != axis.noted:
+                axis.noted = cells.state[0]
+                kind, text = transition_event(axis.noted, cells.reason[0])
+                self._recorder.event(deadline_ns, k, kind, f"{axis.name}: {text}")
+        self._rings.more_ticks()
+        for axis in self._axes:
+            axis.cells.recorded_ns[0] = self._cells.recorded_ns[0]
+            axis.conclude()
+        self._ended = all(axis.ended for axis in self._axes)

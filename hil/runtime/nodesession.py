@@ -1,0 +1,263 @@
+"""A run of several nodes on one bus: alone on it, guarded, recorded, armed; every way out without torque.
+
+What :mod:`hil.runtime.session` is for one drive, of its parts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from drivers.client import DriveClient
+from drivers.hub import Hub
+from hil.errors import ArmingError
+from hil.log.recorder import Recorder, check_folder
+from hil.runtime import realtime
+from hil.runtime.bus import note_interface, opened_link
+from hil.runtime.claim import ClaimedError, claimed
+from hil.runtime.clock import LockstepClock, RealClock
+from hil.runtime.guardian import Rights, Words, guardian
+from hil.runtime.header import header_of, log_path
+from hil.runtime.inbox import Inbox
+from hil.runtime.loop import Outcome, StopRequest
+from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
+from hil.runtime.nodesetup import Nodes, check_nodes_load
+from hil.runtime.progress import say, watching
+from hil.runtime.refusals import check_arming, check_reachable, check_set_up, needed_bytes
+from hil.runtime.registry import announced, own_entry, who_asked
+from hil.runtime.session import (
+    RunResult,
+    await_drive,
+    hear_others,
+    plan_of,
+    set_by_others,
+    stopping_on_signals,
+    writing,
+)
+from hil.runtime.setup import Setup
+from hil.signals import Reason
+from hil.tick.errorcodes import words as error_words
+from hil.tick.reasons import End, explain
+
+Clock = LockstepClock | RealClock
+
+
+def run_nodes(setups: Nodes, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
+    """Arm and run all nodes; returns after a safe stop of all. Raises HilError before anything is sent."""
+    first = next(iter(setups.values()))
+    for setup in setups.values():
+        check_arming(setup, arm)
+        check_reachable(setup)
+    check_nodes_load(setups)
+    config, path = first.config, log_path(first, "run")
+    check_folder(path, len(setups) * needed_bytes(config))
+    clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
+    with _alone(setups), writing(Recorder(path, None, config.loop.rate_hz, len(setups))) as recorder:
+        for name, setup in setups.items():
+            setup.machine.looped()
+            with _said_of(name):
+                check_set_up(setup)
+        with _guarding(setups, recorder) as words:
+            return _recorded(setups, request or StopRequest(), recorder, clock, words)
+
+
+@contextlib.contextmanager
+def _said_of(name: str) -> Iterator[None]:
+    """A refusal says which node it is of."""
+    try:
+        yield
+    except ArmingError as error:
+        raise ArmingError(f"node {name}: {error}") from error
+
+
+@contextlib.contextmanager
+def _alone(setups: Nodes) -> Iterator[None]:
+    """No other process of this machine may send what this run sends. Raises ArmingError."""
+    bus, sent = next(iter(setups.values())).config.bus, []
+    for setup in setups.values():
+        sent += [bound.message for bound in setup.binding.outgoing]
+        sent += [setup.binding.sync] if setup.binding.sync else []
+    try:
+        with claimed(bus.interface, bus.channel, {f"0x{message.send_id:X}" for message in sent}):
+            yield
+    except ClaimedError as error:
+        raise ArmingError(f"nothing was sent: {error}; to look on: hil watch") from error
+
+
+def _clients(setups: Nodes, recorder: Recorder | None, clock: Clock | None) -> list[DriveClient]:
+    """A client for each node on one link."""
+    first = next(iter(setups.values()))
+    hub = Hub(opened_link(first), [setup.binding for setup in setups.values()])
+    on_frames = recorder.frames if recorder and first.config.log.frames else None
+    now = clock.now_ns if clock else time.monotonic_ns
+    return [
+        DriveClient(port, one.database, on_frames=on_frames, now=now, drive_map=one.binding.map)
+        for port, one in zip(hub.ports, setups.values(), strict=True)
+    ]
+
+
+class Stopper:
+    """The guardian's way to stop all nodes, in the configuration's order."""
+
+    def __init__(self, clients: Sequence[DriveClient], cells: Any) -> None:
+        self._clients, self._cells = clients, cells
+
+    def stop_from(self, counter: int) -> None:
+        """Each node's stop frames, with counters after its own last; never raises."""
+        for place, client in enumerate(self._clients, COUNTERS):
+            client.stop_from(self._cells[place])
+
+
+@contextlib.contextmanager
+def _guarding(setups: Nodes, recorder: Recorder) -> Iterator[Words | None]:
+    """One guardian for all nodes, unless time stands still or the bus is this process's own."""
+    config = next(iter(setups.values())).config
+    if config.bus.interface == "virtual" or config.loop.clock == "lockstep" or not config.guardian.enabled:
+        yield None
+        return
+    shared, asked = Words(), config.realtime
+
+    def stopper() -> Stopper:
+        recorder.leave()
+        return Stopper(_clients(setups, None, None), shared.cells)
+
+    rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
+    with guardian(config.guardian.timeout_ns(config.loop), rights, stopper, shared) as words:
+        yield words
+
+
+def _recorded(
+    setups: Nodes, request: StopRequest, recorder: Recorder, clock: Clock, words: Words | None
+) -> RunResult:
+    """Open the drives and the log, arm, run."""
+    first = next(iter(setups.values()))
+    with contextlib.ExitStack() as held:
+        clients = _clients(setups, recorder, clock)
+        for client in clients:  # the first, which closes the bus, last
+            held.callback(client.close)
+        recorder.begin(nodes_header(setups, clock.name))
+        bus = first.config.bus
+        say(f"waiting for {' and '.join(setups)} on {bus.interface}:{bus.channel}")
+        for ask in (await_drive, hear_others):
+            for (name, setup), client in zip(setups.items(), clients, strict=True):
+                with _said_of(name):
+                    ask(setup, client)
+        recorder.await_open()
+        say(f"arming; log {recorder.path}")
+        machines = [setup.machine.fresh() for setup in setups.values()]
+        machines = machines if request.ramps else [machine.at_once() for machine in machines]
+        records = [recorder.record, *recorder.more_records]
+        axes = [Axis(*parts) for parts in zip(setups, clients, machines, records, strict=True)]
+        takes = set_by_others(first)
+        inbox = held.enter_context(contextlib.closing(Inbox(machines[0], takes)))
+        for client in clients:  # in operation after arming; every way out leaves it
+            held.callback(client.leave)
+            client.start()
+            client.flush()
+        loop = NodesLoop(
+            axes, clock, recorder, plan_of(first.config), request, words, inbox if takes else None
+        )
+        clients[0].discard()
+        return _run_armed(first, axes, loop, recorder, clock, request, takes)
+
+
+def nodes_header(setups: Nodes, clock: str) -> dict[str, Any]:
+    """The header of the first node's log, and beside it what is another node's own."""
+    (_, first), *more = setups.items()
+    header = header_of(first, "run", clock)
+    header["nodes"] = [name for name, _ in more]
+    header["more"] = {"nodes": {"names": ",".join(setups)}}
+    for name, setup in more:
+        own = header_of(setup, "run", clock)
+        header["more"][f"run of {name}"] = own["metadata"]
+        header["attachments"] |= {
+            f"{what} of {name}": text for what, text in own["attachments"].items() if what != "config.toml"
+        }
+    return header
+
+
+def _run_armed(
+    first: Setup,
+    axes: Sequence[Axis],
+    loop: NodesLoop,
+    recorder: Recorder,
+    clock: Clock,
+    request: StopRequest,
+    takes: dict[str, tuple[float, float, float]],
+) -> RunResult:
+    config, plan = first.config, plan_of(first.config)
+    outcome, failure, processor_ns = Outcome(), "", 0
+    grants: list[realtime.Grant] = []
+    try:
+        with stopping_on_signals(request):
+            note_interface(config, recorder, clock.now_ns(), 0)
+            if clock.name == "monotonic":
+                realtime.keep_off(recorder.writer_pid, config.realtime.cpu)
+                grants = realtime.acquire(config.realtime)
+            where = f"{config.bus.interface}:{config.bus.channel}"
+            entry = own_entry(recorder.path, where, config.loop.rate_hz, plan.ticks, clock.name, takes)
+            with announced(entry), watching(os.getpid(), plan.ticks):
+                begin_ns = time.thread_time_ns()
+                outcome = loop.run()
+                processor_ns = time.thread_time_ns() - begin_ns
+    except BaseException as error:
+        failure = f"{type(error).__name__}: {error}"
+        raise
+    finally:
+        realtime.release()
+        last_k = outcome.ticks + outcome.skipped
+        note_interface(config, recorder, clock.now_ns(), last_k)
+        if asked := who_asked(os.getpid()):
+            t_ns, k, who = asked
+            recorder.event(t_ns, k, "stop-asked", who)
+        ends = {axis.name: _end(axis, recorder, clock.now_ns(), last_k) for axis in axes}
+        cause = cause_of(axes)
+        dropped, result = recorder.dropped, _result(outcome, axes, ends, cause)
+        complete = recorder.close(result | ({"ended": failure} if failure else {}))
+        if not complete:
+            kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"
+            say(f"log {recorder.path} is not complete{kept}")
+    why = Outcome(
+        outcome.ticks, outcome.skipped, cause.outcome.reason, cause.outcome.state, cause.outcome.stop
+    )
+    processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
+    nodes = {axis.name: result["nodes"][axis.name] for axis in axes}
+    path = str(recorder.path)
+    return RunResult(path, why, complete, dropped, grants, processor_us, ends[cause.name], nodes)
+
+
+def cause_of(axes: Sequence[Axis]) -> Axis:
+    """The node for whose sake the run ended: the first with a reason that is not another node's."""
+    own = [axis for axis in axes if axis.outcome.reason not in (Reason.NODE_STOPPED, Reason.STOP_REQUESTED)]
+    return (own or list(axes))[0]
+
+
+def _end(axis: Axis, recorder: Recorder, now_ns: int, k: int) -> End | None:
+    """Why a node's run ended; what it said of itself goes to the log."""
+    if odd := axis.client.odd_length():
+        recorder.event(now_ns, k, "length", f"{axis.name}: {odd}")
+        say(f"{axis.name}: {odd}; none of another length is taken: correct the DBC, or the drive's mapping")
+    with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
+        axis.client.flush()
+    stop = axis.outcome.stop
+    if stop is None:
+        return None
+    if code := int(stop[0]["drive_error"]):
+        recorder.event(now_ns, int(stop[0]["k"]), "drive-error", f"{axis.name}: {error_words(code)}")
+    return explain(axis.machine.safety, axis.machine.safety_state, stop[0])
+
+
+def _result(
+    outcome: Outcome, axes: Sequence[Axis], ends: dict[str, End | None], cause: Axis
+) -> dict[str, Any]:
+    """The run's result as the log keeps it: of the node for whose sake it ended, and each node's."""
+    nodes: dict[str, dict[str, Any]] = {}
+    for axis in axes:
+        end = ends[axis.name]
+        nodes[axis.name] = {"ended": Reason(axis.outcome.reason).name.lower()}
+        nodes[axis.name] |= {"end": end.as_dict()} if end else {}
+    shared = {"ticks": outcome.ticks, "skipped": outcome.skipped, "node": cause.name}
+    return nodes[cause.name] | shared | {"nodes": nodes}
