@@ -73,7 +73,7 @@ def test_a_command_for_one_drive_takes_one_node() -> None:
         ('drive.1.kind="query"', "node load: drive.kind: 'query' is not one of"),
         ('loop.pacing="feedback"', 'loop.pacing: several nodes answer one SYNC; take "sync"'),
         ("loop.shadow=true", "loop.shadow: not with several nodes; take one: --set node=NAME"),
-        ("feedback.period_ms=2.0", "motor: feedback.period_ms: several nodes measure in each tick; remove it"),
+        ("feedback.period_ms=2.0", "motor: feedback.period_ms: several nodes measure in each tick"),
         ("log.split_s=2.0", "log.split_s, log.split_mb: a log of several nodes is one file"),
         ('drive.1.controller.torque_n_m=[1.0]', "controller: torque_n_m has 1 entries and for_s 3"),
         ('drive.1.controller.kind="cascade"', "node load: "),
