@@ -34,6 +34,7 @@ from hil.report.metrics import operating
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import GuardFlag, Reason, TickArray
 from hil.sim.simulate import simulate, simulate_ticks
+from hil.tick.guard import NO_ANGLE
 from tests.conftest import CONFIGS
 
 PATH = CONFIGS / "current.toml"
@@ -397,4 +398,4 @@ def test_todays_parameters_are_neutral() -> None:
     p = load_setup(CONFIGS / "demo.toml", Overrides()).machine
     for name in ("k_u", "u_i", "told", "delay", "lag", "share", "kappa", "g_u"):
         assert name in LAW_PARAMS.fields and not p.law[name].any()
-    assert not p.safety["k_u"].any() and not p.safety["absent"].any()
+    assert not p.safety["k_u"].any() and p.safety["absent"].tolist() == [NO_ANGLE]

@@ -61,7 +61,7 @@ def test_no_statistics_are_stamped_before_the_first_tick(tmp_path: Path) -> None
     ticks, frames, events = (Ring.create(name, size, 16) for name, size in sizes.items())
     first = TICKS[100:101]
     with RunFile(tmp_path / "a.mcap", HEADER) as file:
-        drain = Drain((ticks, frames, events), file)
+        drain = Drain((ticks, frames, events), file, {})
         drain.once()
         drain.stats()
         ticks.push(first.tobytes())

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from hil.signals import Reason
+from hil.tick import guard as rules
 from hil.tick.guard import (
     NO_I_D,
     NO_I_Q,
@@ -20,6 +21,10 @@ from hil.tick.guard import (
 from tests.safety import Guard
 
 NEITHER = NO_I_Q | NO_I_D
+
+
+def test_what_is_not_reported_has_a_bit_of_its_own_as_logs_keep_it() -> None:
+    assert (rules.NO_I_Q, rules.NO_I_D, rules.NO_ANGLE) == (1, 2, 4)
 
 
 def guard_of(absent: int = 0, **changed: float) -> Guard:

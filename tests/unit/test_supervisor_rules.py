@@ -176,11 +176,16 @@ def test_an_echo_that_is_wrong_is_held_for_from_when_feedback_is_due() -> None:
     assert [echo(guard, 5, 1) for _ in range(3)] == [(0, 1), (0, 6), (Reason.COMMAND_LOST, 11)]
 
 
-@pytest.mark.parametrize(("scheduled", "right"), [(15, True), (31, True), (14, False), (0, False)])
-def test_an_echo_may_stand_still_where_the_counter_comes_round(scheduled: int, right: bool) -> None:
-    guard = bench(hold_ticks=2, scheduled=scheduled, counter_modulus=16)
-    assert echo(guard, 3, 3) == (0, 0)
-    assert echo(guard, 3, 3) == (0, 0 if right else 1)
+@pytest.mark.parametrize(
+    ("scheduled", "modulus", "right"),
+    [(15, 16, True), (31, 16, True), (1, 2, True), (14, 16, False), (0, 16, False)],
+)
+def test_an_echo_may_stand_still_where_the_counter_comes_round(
+    scheduled: int, modulus: int, right: bool
+) -> None:
+    guard = bench(hold_ticks=2, scheduled=scheduled, counter_modulus=modulus)
+    assert echo(guard, 1, 1) == (0, 0)
+    assert echo(guard, 1, 1) == (0, 0 if right else 1)
 
 
 def test_an_echo_may_not_stand_still_because_each_counter_has_one_number() -> None:
