@@ -287,7 +287,8 @@ def test_columns_are_the_fields_of_the_records(tmp_path: Path) -> None:
         for name in parts[0]:
             np.testing.assert_array_equal(np.concatenate([part[name] for part in parts]), ticks[name])
         first = ticks[np.argmax(ticks["reason"] != 0)]
-        assert first["reason"] != 0 and first["k"] < ticks["k"][-1] and room.stop[0].tobytes() == first.tobytes()
+        assert first["reason"] != 0 and first["k"] < ticks["k"][-1]
+        assert room.stop[0].tobytes() == first.tobytes()
 
 
 def test_the_longest_is_that_of_all() -> None:

@@ -20,6 +20,7 @@ MAY_SEND = {
     ("drivers/client.py", "_transmit"),  # what `send` and `stop` lay out from a guarded tick, and SYNC
     ("drivers/rawlink.py", "send_raw"),  # passes on what the client sends
     ("drivers/lockstep.py", "send"),  # passes on what the client sends
+    ("drivers/hub.py", "send"),  # passes on what the clients of two nodes send
     ("drivers/sdo.py", "send_message"),  # hil configure, and reads before arming: SDO alone
     ("drivers/canopen_node.py", "pre_operational"),  # hil configure: takes a node out of operation
     ("hil/runtime/bus.py", "sending_bus"),  # hil play: recorded frames, onto emulated buses unless allowed
