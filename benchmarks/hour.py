@@ -3,8 +3,8 @@
     python -m benchmarks.hour [--json] [--keep FOLDER] [ENDING ...]
 
 Two logs: 3.6 million ticks by `hil simulate`; and the same ticks with three made-up frames each, 10.8
-million, as a run on a bus logs them. Frames hold random bytes, which compress worse than a run's. Replay
-and report run on one core, too: they use two. With endings (.parquet .csv ...) only these exports are made.
+million, as a run on a bus logs them. Frames hold random bytes, which compress worse than a run's. With
+endings (.parquet .csv ...) only these exports are made.
 """
 
 from __future__ import annotations
@@ -46,17 +46,14 @@ class Cost:
     file_mb: float
 
 
-def cost(out: Path, *words: str, cores: int | None = None) -> Cost:
-    """Run a command of hil that writes ``out``, on the first ``cores`` that there are."""
-    start, there = time.perf_counter(), os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(there)[:cores])
+def cost(out: Path, *words: str) -> Cost:
+    """Run a command of hil that writes ``out``."""
+    start = time.perf_counter()
     process = subprocess.Popen([sys.executable, "-m", "hil.cli", *words], stdout=subprocess.DEVNULL)
-    os.sched_setaffinity(0, there)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     seconds = time.perf_counter() - start
     text = " ".join(("hil", *(Path(word).name if "/" in word else word for word in words)))
-    text += f" (cores: {cores})" if cores else ""
     if process.returncode:
         raise SystemExit(f"{text} ended with {process.returncode}")
     processor_s = usage.ru_utime + usage.ru_stime
@@ -104,10 +101,9 @@ def costs(folder: Path, endings: list[str]) -> Iterator[Cost]:
     if not endings:
         for log in (plain, full):
             yield cost(log, "info", str(log))
+            yield cost(log, "replay", str(log))
             out = folder / f"{log.stem}.html"
-            for cores in (1, None):
-                yield cost(log, "replay", str(log), cores=cores)
-                yield cost(out, "report", str(log), "-o", str(out), cores=cores)
+            yield cost(out, "report", str(log), "-o", str(out))
     for ending in endings or FORMATS:
         for log in (plain, full) if FORMATS[ending][0] == "ticks" else (full,):
             out = folder / f"{log.stem}{ending}"

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from drivers.jit import COMPILED, array_at, entry, jit, numba_types, place_of, waiting
+from drivers.jit import COMPILED, array_at, entry, jit, numba_types, place_of
 
-__all__ = ["COMPILED", "array_at", "entry", "jit", "numba_types", "place_of", "waiting"]
+__all__ = ["COMPILED", "array_at", "entry", "jit", "numba_types", "place_of"]

@@ -10,7 +10,6 @@ import contextlib
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -18,14 +17,13 @@ from typing import Any, Final, Literal, NamedTuple, Self
 import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
-from mcap.records import Channel, Footer, Header, McapRecord, Metadata, Schema, Statistics
+from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, Schema, Statistics
 
-from hil.log.ahead import ahead
 from hil.log.container import FIXED_BYTES, LIBRARY
 from hil.log.errors import DamagedError, LogError, UnknownCompressionError
 from hil.log.layouts import FORMAT
 from hil.log.mcapfile import MESSAGE
-from hil.log.scan import Raw, chunk_rows, gathered, parse, parse_attachment, raw_records
+from hil.log.scan import Raw, chunk_content, chunk_rows, gathered, parse, parse_attachment, raw_records
 from hil.log.schema import (
     FRAME_HEAD,
     FRAME_MESSAGE,
@@ -166,8 +164,8 @@ class _Pass:
         self.unreadable = ""
         """Why no chunk could be read at all."""
 
-    def take(self, raw: Raw, content: Future[bytes] | None) -> Iterator[Block]:
-        """What a record of the file brings, ``content`` that of a chunk; one that is damaged is named."""
+    def take(self, raw: Raw) -> Iterator[Block]:
+        """What a record of the file brings; one that is damaged is named and left out."""
         if raw.opcode in (Opcode.CHUNK, MESSAGE) and not self._begun:
             self._begun = True
             self._look_ahead(raw.offset)
@@ -177,10 +175,12 @@ class _Pass:
                 self._keep(self.log.attachments, name, data.decode(errors="replace"))
             elif raw.opcode == MESSAGE:
                 yield from self._chunk(raw.content)
-            elif content is not None:
-                yield from self._chunk(content.result())
-            elif (record := parse(raw.opcode, raw.content)) is not None:
-                self._define(record)
+            else:
+                record = parse(raw.opcode, raw.content)
+                if isinstance(record, Chunk):
+                    yield from self._chunk(chunk_content(record))
+                elif record is not None:
+                    self._define(record)
         except DamagedError as error:
             self.problems.append(f"{error} (at byte {raw.offset})")
             self.log.bytes_lost += len(raw.content)
@@ -303,8 +303,7 @@ class _Pass:
         same = (messages["opcode"] == MESSAGE) & (messages["channel"] == self._tick_channel)
         if not (same & (messages["length"] == FIXED_BYTES + layout.itemsize)).all():
             return None
-        rows = np.frombuffer(data, np.uint8).reshape(len(messages), -1)
-        records = rows[:, -layout.itemsize :].copy().view(layout)[:, 0]  # a field of void is copied slowly
+        records = np.ascontiguousarray(messages["data"]).view(layout)
         return self._form.today(records) if self._form.fits(records) else None
 
     def _messages(self, topic: str, data: bytes, rows: Rows) -> Iterator[Block]:
@@ -423,8 +422,8 @@ def _read_file(log: Log) -> Iterator[Block]:
     """One file."""
     one = _Pass(log)
     try:
-        for raw, content in ahead(gathered(raw_records(log.path))):
-            yield from one.take(raw, content)
+        for raw in gathered(raw_records(log.path)):
+            yield from one.take(raw)
     except DamagedError as error:
         one.problems.append(str(error))
     except OSError as error:

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from hil.config.design import Machine
-from hil.control.jit import waiting
+from hil.control.jit import jit
 from hil.log.check import first_broken
-from hil.replay.rows import copy_fields, unequal_row
 from hil.replay.verdict import Difference
 from hil.signals import FIELDS, INPUTS, OUTPUTS, TickArray, new_ticks
 from hil.tick.kernel import step
 
-_KINDS: Final = {field.name: field.kind for field in FIELDS}
-_GIVEN: Final = frozenset(field.name for field in FIELDS if field.role == "time" or field.name in INPUTS)
+_KINDS = {field.name: field.kind for field in FIELDS}
 
 
-@waiting
+@jit
 def fold(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
     """Run the controller over ticks whose inputs are set, in place."""
     for j in range(ticks.shape[0]):
@@ -28,7 +26,9 @@ def fold(sp: Any, ss: Any, lp: Any, ls: Any, ticks: Any) -> None:
 
 def set_inputs(ticks: TickArray, logged: TickArray) -> None:
     """Copy times and inputs of the logged ticks; every output is left to be computed."""
-    copy_fields(logged, ticks, _GIVEN)
+    for field in FIELDS:
+        if field.role == "time" or field.name in INPUTS:
+            ticks[field.name] = logged[field.name]
 
 
 def refold(machine: Machine, logged: TickArray) -> TickArray:
@@ -55,14 +55,22 @@ def bits(values: npt.NDArray[Any], kind: str) -> npt.NDArray[np.int64]:
 
 def compare(logged: TickArray, again: TickArray, absent: frozenset[str] = frozenset()) -> Difference | None:
     """The first tick and field whose bits differ; what the log lacks is not compared."""
-    own = frozenset(OUTPUTS) - absent
-    row = unequal_row(logged, again, own)
-    if row is None:
+    if logged.tobytes() == again.tobytes():
         return None
-    ours, theirs = logged[row : row + 1], again[row : row + 1]
-    name = next(n for n in OUTPUTS if n in own and ours[n].tobytes() != theirs[n].tobytes())
-    ulp = abs(int(bits(ours[name], _KINDS[name])[0]) - int(bits(theirs[name], _KINDS[name])[0]))
-    return Difference(int(ours["k"][0]), name, float(ours[name][0]), float(theirs[name][0]), ulp)
+    first: tuple[int, str] | None = None
+    for name in OUTPUTS:
+        if name in absent:
+            continue
+        a, b = np.ascontiguousarray(logged[name]), np.ascontiguousarray(again[name])
+        unequal = np.nonzero(a.view(f"u{a.itemsize}") != b.view(f"u{b.itemsize}"))[0]
+        if len(unequal) and (first is None or unequal[0] < first[0]):
+            first = (int(unequal[0]), name)
+    if first is None:
+        return None
+    row, name = first
+    ours, theirs = logged[name][row : row + 1], again[name][row : row + 1]
+    ulp = abs(int(bits(ours, _KINDS[name])[0]) - int(bits(theirs, _KINDS[name])[0]))
+    return Difference(int(logged["k"][row]), name, float(ours[0]), float(theirs[0]), ulp)
 
 
 def ulp_between(logged: float, other: float, kind: str) -> int:

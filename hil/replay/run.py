@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -37,15 +36,10 @@ class Window:
 
     def of(self, ticks: TickArray, first_ns: int) -> TickArray:
         """The ticks inside."""
-        if self == WHOLE:
-            return ticks
         at = (ticks["t_ns"] - np.uint64(first_ns)) * 1e-9
         inside = (at >= self.start_s) & (at <= self.end_s)
         chosen: TickArray = ticks if inside.all() else ticks[inside]  # choosing copies field by field
         return chosen
-
-
-WHOLE: Final = Window()
 
 
 @dataclass(slots=True)
@@ -63,14 +57,11 @@ class Replay:
     impossible: str = ""
     notes: tuple[str, ...] = ()
     difference: Difference | None = None
-    _beside: ThreadPoolExecutor = dataclasses.field(
-        default_factory=lambda: ThreadPoolExecutor(1, "hil-check")
-    )
 
     @property
     def whole(self) -> bool:
         """True when the whole run is compared."""
-        return self.window == WHOLE
+        return self.window == Window()
 
     def feed(self, ticks: TickArray) -> bool:
         """Take the next ticks; False when there is no more to learn."""
@@ -109,10 +100,12 @@ class Replay:
         assert self.machine is not None  # noqa: S101 - _begin made it
         whole = self._before_gap(ticks)
         if len(whole):
-            logged, absent = self.window.of(whole, self.first_ns), self.log.absent
-            checked = self._beside.submit(broken, logged, absent)
-            again = self.window.of(refold(self.machine, whole), self.first_ns)
-            self.difference = earliest(checked.result(), compare(logged, again, absent))
+            again = refold(self.machine, whole)
+            logged = self.window.of(whole, self.first_ns)
+            self.difference = earliest(
+                broken(logged, self.log.absent),
+                compare(logged, self.window.of(again, self.first_ns), self.log.absent),
+            )
             self.ticks, self.compared = self.ticks + len(whole), self.compared + len(logged)
             self.last_k = int(whole["k"][-1])
         past = len(whole) > 0 and (int(whole["t_ns"][-1]) - self.first_ns) * 1e-9 > self.window.end_s
@@ -211,8 +204,8 @@ def replay(
     """
     try:
         log = new_log(source)
-        verdict = _run(Replay(log, window or WHOLE), read_blocks(log), seen or (lambda _: None))
-        return _each(source, window or WHOLE, log.nodes, verdict) if log.nodes else verdict
+        verdict = _run(Replay(log, window or Window()), read_blocks(log), seen or (lambda _: None))
+        return _each(source, window or Window(), log.nodes, verdict) if log.nodes else verdict
     except (HilError, ValueError) as error:
         return Verdict("cannot", 0, why=str(error))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -162,14 +161,14 @@ def collect(source: Source, *, verify: bool = True) -> Run:
     """Read a log, and replay it when ``verify``. Raises LogError for what is no log of hil."""
     log = new_log(source)
     run, again, more = Run(log, log.path.stem), Replay(log), verify
-    with ThreadPoolExecutor(1, "hil-replay") as pool:
-        for block in read_blocks(log):
-            if block.kind == "ticks" and len(block.records):
-                beside = pool.submit(again.feed, block.records) if more else None
-                run.feed(block.records)
-                more = beside is not None and beside.result()
-            elif len(block.records):
-                run.frames.feed(block.records)
+    for block in read_blocks(log):
+        if not len(block.records):
+            continue
+        if block.kind == "ticks":
+            run.feed(block.records)
+            more = more and again.feed(block.records)
+        else:
+            run.frames.feed(block.records)
     with np.errstate(invalid="ignore", over="ignore"):
         run.responses.finish()
     if run.config is None and not run.config_problem:  # there was no tick

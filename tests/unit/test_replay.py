@@ -11,9 +11,8 @@ import pytest
 from hil.errors import HilError
 from hil.log.reader import open_log
 from hil.replay import Verdict, compare, machine_of, replay, replay_log, replayed
-from hil.replay.rows import copy_fields, unequal_row
 from hil.runtime.setup import Overrides, load_setup
-from hil.signals import FIELDS, INPUTS, OUTPUTS
+from hil.signals import INPUTS
 from hil.sim.simulate import simulate
 
 
@@ -53,25 +52,6 @@ def test_a_flipped_output_is_one_ulp_off(logged: Path) -> None:
     ticks["d_hat_w"][777] = np.nextafter(ticks["d_hat_w"][777], np.inf)
     found = compare(ticks, replayed(machine_of(log), ticks))
     assert found is not None and (found.tick, found.field, found.ulp) == (777, "d_hat_w", 1)
-
-
-def test_fields_are_copied_and_compared_alone(logged: Path) -> None:
-    """Each field and some sets: a range of bytes reaches over the tags between neighbours, over no more."""
-    ticks, rng = open_log(logged).ticks[:3].copy(), np.random.default_rng(1)
-    names = [field.name for field in FIELDS]
-    sets = [{name} for name in names] + [set(rng.choice(names, 30)) for _ in range(50)] + [set(OUTPUTS)]
-    for own in map(frozenset, sets):
-        other = ticks.copy()
-        for name in names:
-            bits = np.ascontiguousarray(ticks[name]).view(f"u{ticks[name].itemsize}")
-            other[name] = np.where(np.arange(3) == 1, ~bits, bits).view(ticks.dtype[name])
-        copied = ticks.copy()
-        copy_fields(other, copied, own)
-        for name in names:
-            wanted = other if name in own else ticks
-            assert copied[name].tobytes() == wanted[name].tobytes(), (name, own)
-        assert unequal_row(ticks, copied, own) == 1
-        assert unequal_row(ticks, copied, set(names) - own) is None
 
 
 def test_missing_records_end_the_comparison(logged: Path) -> None:
