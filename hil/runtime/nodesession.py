@@ -6,7 +6,6 @@ What :mod:`hil.runtime.session` is for one drive, of its parts.
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -16,7 +15,7 @@ from drivers.hub import Hub
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder, check_folder
 from hil.runtime import realtime
-from hil.runtime.bus import note_interface, opened_link
+from hil.runtime.bus import opened_link
 from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import Rights, Words, guardian
@@ -25,16 +24,16 @@ from hil.runtime.inbox import Inbox
 from hil.runtime.loop import Outcome, StopRequest
 from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
 from hil.runtime.nodesetup import Nodes, check_nodes_load
-from hil.runtime.progress import say, watching
+from hil.runtime.progress import say
 from hil.runtime.refusals import check_arming, check_reachable, check_set_up, needed_bytes
-from hil.runtime.registry import announced, own_entry, who_asked
 from hil.runtime.session import (
     RunResult,
     await_drive,
+    driving,
     hear_others,
     plan_of,
+    released,
     set_by_others,
-    stopping_on_signals,
     writing,
 )
 from hil.runtime.setup import Setup
@@ -188,31 +187,19 @@ def _run_armed(
     request: StopRequest,
     takes: dict[str, tuple[float, float, float]],
 ) -> RunResult:
-    config, plan = first.config, plan_of(first.config)
     outcome, failure, processor_ns = Outcome(), "", 0
     grants: list[realtime.Grant] = []
     try:
-        with stopping_on_signals(request):
-            note_interface(config, recorder, clock.now_ns(), 0)
-            if clock.name == "monotonic":
-                realtime.keep_off(recorder.writer_pid, config.realtime.cpu)
-                grants = realtime.acquire(config.realtime)
-            where = f"{config.bus.interface}:{config.bus.channel}"
-            entry = own_entry(recorder.path, where, config.loop.rate_hz, plan.ticks, clock.name, takes)
-            with announced(entry), watching(os.getpid(), plan.ticks):
-                begin_ns = time.thread_time_ns()
-                outcome = loop.run()
-                processor_ns = time.thread_time_ns() - begin_ns
+        with driving(first.config, recorder, clock, request, takes) as grants:
+            begin_ns = time.thread_time_ns()
+            outcome = loop.run()
+            processor_ns = time.thread_time_ns() - begin_ns
     except BaseException as error:
         failure = f"{type(error).__name__}: {error}"
         raise
     finally:
-        realtime.release()
         last_k = outcome.ticks + outcome.skipped
-        note_interface(config, recorder, clock.now_ns(), last_k)
-        if asked := who_asked(os.getpid()):
-            t_ns, k, who = asked
-            recorder.event(t_ns, k, "stop-asked", who)
+        released(first.config, recorder, clock, last_k)
         ends = {axis.name: _end(axis, recorder, clock.now_ns(), last_k) for axis in axes}
         cause = cause_of(axes)
         dropped, result = recorder.dropped, _result(outcome, axes, ends, cause)

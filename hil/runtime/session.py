@@ -185,7 +185,7 @@ def _recorded(
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()
-            return _run_armed(setup, machine, loop, plan, recorder, clock, request, takes, client)
+            return _run_armed(setup, machine, loop, recorder, clock, request, takes, client)
 
 
 @contextlib.contextmanager
@@ -251,7 +251,6 @@ def _run_armed(
     setup: Setup,
     machine: Machine,
     loop: Loop,
-    plan: Plan,
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
@@ -261,27 +260,15 @@ def _run_armed(
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:
-        with stopping_on_signals(request):
-            note_interface(setup.config, recorder, clock.now_ns(), 0)
-            if clock.name == "monotonic":
-                realtime.keep_off(recorder.writer_pid, setup.config.realtime.cpu)
-                grants = realtime.acquire(setup.config.realtime)
-            bus, rate_hz = setup.config.bus, setup.config.loop.rate_hz
-            where = f"{bus.interface}:{bus.channel}"
-            entry = own_entry(recorder.path, where, rate_hz, plan.ticks, clock.name, takes)
-            with announced(entry), watching(os.getpid(), plan.ticks):
-                begin_ns = time.thread_time_ns()
-                outcome = loop.run()
-                processor_ns = time.thread_time_ns() - begin_ns
+        with driving(setup.config, recorder, clock, request, takes) as grants:
+            begin_ns = time.thread_time_ns()
+            outcome = loop.run()
+            processor_ns = time.thread_time_ns() - begin_ns
     except BaseException as error:
         failure = f"{type(error).__name__}: {error}"
         raise
     finally:
-        realtime.release()
-        note_interface(setup.config, recorder, clock.now_ns(), outcome.ticks + outcome.skipped)
-        if asked := who_asked(os.getpid()):
-            t_ns, k, who = asked
-            recorder.event(t_ns, k, "stop-asked", who)
+        released(setup.config, recorder, clock, outcome.ticks + outcome.skipped)
         if odd := client.odd_length():
             recorder.event(clock.now_ns(), outcome.ticks + outcome.skipped, "length", odd)
             say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
@@ -302,6 +289,36 @@ def _run_armed(
             say(f"log {recorder.path} is not complete{kept}")
     processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
     return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us, end)
+
+
+@contextlib.contextmanager
+def driving(
+    config: RunConfig,
+    recorder: Recorder,
+    clock: RealClock | LockstepClock,
+    request: StopRequest,
+    takes: dict[str, tuple[float, float, float]],
+) -> Iterator[list[realtime.Grant]]:
+    """While the loop runs: signals stop it, the rights asked for are granted, others see it."""
+    ticks, where = plan_of(config).ticks, f"{config.bus.interface}:{config.bus.channel}"
+    with stopping_on_signals(request):
+        note_interface(config, recorder, clock.now_ns(), 0)
+        grants: list[realtime.Grant] = []
+        if clock.name == "monotonic":
+            realtime.keep_off(recorder.writer_pid, config.realtime.cpu)
+            grants = realtime.acquire(config.realtime)
+        entry = own_entry(recorder.path, where, config.loop.rate_hz, ticks, clock.name, takes)
+        with announced(entry), watching(os.getpid(), ticks):
+            yield grants
+
+
+def released(config: RunConfig, recorder: Recorder, clock: RealClock | LockstepClock, last_k: int) -> None:
+    """The rights given back after the loop; the interface's state and who asked for the stop in the log."""
+    realtime.release()
+    note_interface(config, recorder, clock.now_ns(), last_k)
+    if asked := who_asked(os.getpid()):
+        t_ns, k, who = asked
+        recorder.event(t_ns, k, "stop-asked", who)
 
 
 @contextlib.contextmanager
