@@ -23,7 +23,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.motors import MOTORS, NAMES, WRONG, Array, bench, plant, settings
-from hil.config.tables import override, read_toml
+from hil.config.toml import override, read_toml
 from hil.errors import HilError
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, motor_toml, planned, setup_for

@@ -22,7 +22,8 @@ from firmware_model.node import wire_of
 from hil.campaign.figures import KEYS, Judged
 from hil.campaign.margins import design_margins
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
-from hil.config.tables import RunConfig, override, put, read_toml, validate
+from hil.config.tables import RunConfig, validate
+from hil.config.toml import override, put, read_toml
 from hil.control.errors import ControlDesignError
 from hil.control.law import exact_after
 from hil.errors import ConfigError, HilError

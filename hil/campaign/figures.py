@@ -15,7 +15,8 @@ from typing import Any, Final, cast
 import numpy as np
 
 from hil.campaign.margins import DESIGN
-from hil.config.tables import LimitsTable, RunConfig
+from hil.config.limits import LimitsTable
+from hil.config.tables import RunConfig
 from hil.report.criteria import FIGURES, check_limit, demanded
 from hil.report.curves import F8
 from hil.report.excursions import Excursions

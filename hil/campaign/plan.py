@@ -23,7 +23,9 @@ from scipy.stats import qmc
 
 from hil.campaign.normal import normal, root
 from hil.campaign.values import FORMS, NAMES, Distribution, corners, distribution, number
-from hil.config.tables import Table, read_toml, validate
+from hil.config.table import Table
+from hil.config.tables import validate
+from hil.config.toml import read_toml
 from hil.errors import ConfigError
 
 PLANT: Final = "plant:"

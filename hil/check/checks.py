@@ -21,7 +21,8 @@ from drivers.mapping import MEASURED
 from hil.check.filtered import filter_rows
 from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.check.seldom import seldom_rows
-from hil.config.tables import BusTable, LimitsTable
+from hil.config.limits import LimitsTable
+from hil.config.loop import BusTable
 from hil.control.law import CASCADE, PI
 from hil.errors import ConfigError, HilError, plain
 from hil.runtime.bus import bus_settings, is_emulated_bus

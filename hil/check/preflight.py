@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from hil.config.tables import RealtimeTable
+from hil.config.loop import RealtimeTable
 from hil.errors import HilError
 from hil.log.recorder import check_folder
 from hil.runtime import realtime

@@ -12,8 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from hil.config.limits import LimitsTable
+from hil.config.motor import MotorTable
+from hil.config.reference import ReferenceTable
 from hil.config.setpoint_design import setpoint_params
-from hil.config.tables import LimitsTable, MotorTable, ReferenceTable, RunConfig
+from hil.config.tables import RunConfig
 from hil.control.cogging import Harmonics
 from hil.control.errors import ControlDesignError
 from hil.control.jit import COMPILED, entry, place_of

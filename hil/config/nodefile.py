@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from hil.config.nodes import CHOICE, several, taken_apart
-from hil.config.tables import RunConfig, override, read_toml, validate
+from hil.config.tables import RunConfig, validate
+from hil.config.toml import override, read_toml
 
 
 def load_nodes(path: Path, overrides: Iterable[str] = ()) -> dict[str, RunConfig] | None:

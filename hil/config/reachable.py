@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from hil.config.design import WireFacts, motor_model
-from hil.config.tables import ReferenceTable, RunConfig
+from hil.config.reference import ReferenceTable
+from hil.config.tables import RunConfig
 from hil.control.law import LAW_PARAMS
 from hil.control.mtpa import operating_point
 

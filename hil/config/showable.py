@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from hil.config.tables import LimitsTable
+from hil.config.limits import LimitsTable
 from hil.errors import ConfigError
 
 Spans = Mapping[str, tuple[float, float]]

@@ -13,7 +13,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from hil.config.tables import Finite, Positive, RunConfig, Table, load_toml, read_toml, validate
+from hil.config.table import Finite, Positive, Table
+from hil.config.tables import RunConfig, load_toml, validate
+from hil.config.toml import read_toml
 from hil.errors import ConfigError
 from hil.signals import Reason
 

@@ -13,7 +13,10 @@ from typing import Any, Final
 import numpy as np
 
 from hil.config.design import law_spec
-from hil.config.tables import AnticoggingTable, CriteriaTable, RunConfig, TableReference, validate
+from hil.config.limits import CriteriaTable
+from hil.config.motor import AnticoggingTable
+from hil.config.reference import TableReference
+from hil.config.tables import RunConfig, validate
 from hil.control.errors import ControlDesignError
 from hil.control.law import Record, design_law
 from hil.errors import ConfigError, HilError

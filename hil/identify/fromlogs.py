@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from hil.config.tables import MotorTable, RunConfig, validate
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig, validate
 from hil.errors import ConfigError, HilError
 from hil.identify.estimate import Estimate
 from hil.identify.innerloop import estimate_for

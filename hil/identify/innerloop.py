@@ -13,7 +13,8 @@ from typing import Final
 import numpy as np
 
 from hil.config.design import motor_model, speed_filter
-from hil.config.tables import MotorTable, RunConfig
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.control.registry import SpeedFilter

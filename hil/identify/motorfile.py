@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from hil.config.tables import MotorTable, RunConfig
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig
 from hil.identify.estimate import Estimate
 
 KEYS: Final = {

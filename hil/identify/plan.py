@@ -13,7 +13,10 @@ from typing import Any, Final
 from pydantic import TypeAdapter
 
 from hil.config.design import inner_loop
-from hil.config.tables import ControllerTable, MotorTable, ObserverTable, RunConfig, StepReference
+from hil.config.law import ControllerTable, ObserverTable
+from hil.config.motor import MotorTable
+from hil.config.reference import StepReference
+from hil.config.tables import RunConfig
 from hil.control.speedfilter import order_of
 from hil.errors import HilError
 

@@ -9,7 +9,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from hil.config.tables import MotorTable, RunConfig
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig
 from hil.control.errors import ControlDesignError
 from hil.errors import ConfigError, HilError
 from hil.identify.checks import breakaway, seen_in

@@ -17,7 +17,9 @@ from typing import Any, Final
 from hil.campaign.case import Stand
 from hil.campaign.plan import PlanTable
 from hil.campaign.values import toml
-from hil.config.tables import MotorTable, RunConfig, override, read_toml, validate
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig, validate
+from hil.config.toml import override, read_toml
 from hil.errors import HilError
 from hil.runtime.setup import Overrides, Setup
 from hil.tuning.bench import speed_drive

@@ -18,12 +18,13 @@ from typing import Any, Final
 from pydantic import BaseModel, TypeAdapter
 
 import firmware_model.config
-import hil.config.tables
+import hil.config.table
 from drivers.mapping import NO_KEYS, DriveMap
 from firmware_model.config import PlantConfig
 from hil.campaign.plan import CovarianceTable, PlanTable
+from hil.config.mistakes import models_in
 from hil.config.nodes import MOST, NAME, OWN
-from hil.config.tables import RunConfig, models_in
+from hil.config.tables import RunConfig
 from hil.faults.matrix import Expect, Matrix
 from hil.manual.units import unit_of
 
@@ -34,7 +35,7 @@ FILES: Final[dict[str, type[BaseModel]]] = {
     "campaign": PlanTable,
 }
 """Kinds of files: what is run, the emulated drive, the rows of ``hil faults``, a campaign's plan."""
-INCLUDED: Final = (hil.config.tables.included, firmware_model.config.included)
+INCLUDED: Final = (hil.config.table.included, firmware_model.config.included)
 """What lets a table be the path of a file that holds it."""
 USUAL: Final = ("ftdob", "cascade")
 """Kinds that a table may leave out."""

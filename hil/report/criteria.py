@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from hil.config.tables import CriteriaTable
+from hil.config.limits import CriteriaTable
 from hil.report.collect import Run
 from hil.signals import Reason
 

@@ -19,7 +19,8 @@ from drivers.eds import Dictionary, Place, place_of
 from drivers.errors import DatabaseError, DriverError, NodeError
 from drivers.scales import Said, Scales
 from drivers.sdo import REQUEST, Sdo
-from hil.config.tables import CanopenTable, RunConfig
+from hil.config.drive import CanopenTable
+from hil.config.tables import RunConfig
 from hil.errors import ConfigError, HilError
 from hil.log.outputs import output_file
 from hil.runtime.claim import claimed

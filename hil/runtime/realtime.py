@@ -11,7 +11,7 @@ import gc
 import os
 from dataclasses import dataclass
 
-from hil.config.tables import RealtimeTable
+from hil.config.loop import RealtimeTable
 
 _MCL_CURRENT_AND_FUTURE = 3
 _MCL_ONFAULT = 4

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from hil.check.checks import reach_rows, speed_filter_rows
 from hil.check.filtered import filter_rows
 from hil.config.design import speed_filter
-from hil.config.tables import MovingAverageFilter
+from hil.config.drive import MovingAverageFilter
 from hil.control.law import (
     LAW_PARAMS,
     ChannelSpec,

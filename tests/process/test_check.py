@@ -17,7 +17,7 @@ from drivers.listen import Heard, Traffic
 from drivers.local import open_sockets
 from hil.check.checks import bus_rows, interface_rows, load_row, passed, traffic_rows
 from hil.check.preflight import Row, clock_row, disk_row
-from hil.config.tables import BusTable
+from hil.config.loop import BusTable
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags
@@ -303,7 +303,7 @@ def test_clock_and_disk(tmp_path: Path) -> None:
 def test_rights_are_given_back() -> None:
     import os
 
-    from hil.config.tables import RealtimeTable
+    from hil.config.loop import RealtimeTable
     from hil.runtime.realtime import probe
 
     before = os.sched_getaffinity(0)

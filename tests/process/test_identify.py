@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil.config.tables import MotorTable, RunConfig, load_toml
+from hil.config.motor import MotorTable
+from hil.config.tables import RunConfig, load_toml
 from hil.log.reader import open_log
 from hil.replay import replay
 from tests.conftest import CONFIGS, ROOT

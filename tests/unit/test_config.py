@@ -10,8 +10,10 @@ import pytest
 from pydantic import BaseModel
 
 from firmware_model.config import PlantConfig
+from hil.config.mistakes import _tags, models_in
 from hil.config.nodefile import load_nodes
-from hil.config.tables import MAX_CONFIG_BYTES, RunConfig, _tags, load_toml, models_in
+from hil.config.tables import RunConfig, load_toml
+from hil.config.toml import MAX_CONFIG_BYTES
 from hil.errors import ConfigError
 from tests.conftest import ROOT
 

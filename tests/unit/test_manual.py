@@ -13,7 +13,9 @@ import pytest
 
 from firmware_model.config import PlantConfig
 from hil.cli import main
-from hil.config.tables import RunConfig, Table, load_toml, put, validate
+from hil.config.table import Table
+from hil.config.tables import RunConfig, load_toml, validate
+from hil.config.toml import put
 from hil.errors import ConfigError
 from hil.manual import schema
 from hil.manual.keys import Key, found, tables

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hil.config.design import motor_model
-from hil.config.tables import MotorTable, read_toml
+from hil.config.motor import MotorTable
+from hil.config.toml import read_toml
 from hil.paper.continuous import channel_theta, lag, simulate, theta
 from hil.paper.errata import steady_voltage
 from hil.paper.examples import (

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from hil.config.tables import RealtimeTable
+from hil.config.loop import RealtimeTable
 from hil.runtime import realtime
 from hil.runtime.guardian import Rights
 from hil.runtime.realtime import keep_off

@@ -15,7 +15,8 @@ from drivers.codec import Database
 from drivers.dbc import MAX_DBC_BYTES
 from drivers.errors import DatabaseError
 from firmware_model.config import PlantConfig
-from hil.config.tables import MAX_CONFIG_BYTES, RunConfig, load_toml, read_toml
+from hil.config.tables import RunConfig, load_toml
+from hil.config.toml import MAX_CONFIG_BYTES, read_toml
 from hil.errors import ConfigError
 from hil.faults.matrix import Matrix
 from hil.runtime.header import plant_of

@@ -1,0 +1,108 @@
+"""Tables of the motor: what the controller believes, where it is from, and its load torque over the angle."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from hil.config.table import Finite, NonNegative, Positive, Table
+from hil.control.cogging import MOST_ORDER, ORDERS, Harmonics
+
+
+class IdentifiedTable(Table):
+    """What ``hil identify`` adds to a motor: from when and what, 95 % intervals by the motor's keys, noise.
+
+    No run reads it; ``hil tune`` does.
+    """
+
+    date: str
+    """When it was identified, UTC."""
+    drive: str
+    """On which drive and bus."""
+    logs: list[str] = Field([])
+    """The runs that it was estimated from."""
+    low: dict[str, Finite] = Field({})
+    """Lower ends of the 95 % intervals, by the motor's keys."""
+    high: dict[str, Finite] = Field({})
+    """Upper ends of the 95 % intervals, by the motor's keys."""
+    coulomb_n_m: NonNegative | None = None
+    """Coulomb friction."""
+    w_noise_rad_s: NonNegative | None = None
+    """Noise of the measured speed, resolution included, standard deviation."""
+    i_noise_a: NonNegative | None = None
+    """Noise of the measured currents, resolution included, standard deviation."""
+    delay_ticks: Annotated[int, Field(ge=0, le=100)] | None = None
+    """Ticks from sending a voltage to its effect."""
+
+
+class MotorTable(Table):
+    """Parameters of a PMSM: what the controller believes. Amplitude-invariant dq, mechanical speed."""
+
+    name: str = ""
+    """What the motor is called, for reports."""
+    R_s_ohm: Positive
+    """Resistance R_s of a phase."""
+    L_d_h: Positive
+    """Inductance L_d of the d axis."""
+    L_q_h: Positive
+    """Inductance L_q of the q axis."""
+    psi_f_wb: Positive
+    """Flux linkage psi_f of the magnets: peak phase voltage over electrical speed."""
+    n_p: Annotated[int, Field(ge=1, le=100)]
+    """Pole pairs n_p."""
+    J_kg_m2: Positive
+    """Moment of inertia J of motor and load together."""
+    B_f_n_m_s: NonNegative = 0.0
+    """Viscous friction B_f: torque over mechanical speed."""
+    identified: IdentifiedTable | None = None
+    """Where the values come from, when hil identify found them."""
+
+
+class AnticoggingTable(Table):
+    """Load torque over the shaft's angle theta, as hil identify --steps cogging writes it:
+    T_c = sum of cos_n_m cos(n theta) + sin_n_m sin(n theta) over the orders n."""
+
+    date: str = ""
+    """When it was learned, UTC."""
+    drive: str = ""
+    """On which drive and bus."""
+    logs: list[str] = Field([])
+    """The runs that it was learned from."""
+    motor: str = ""
+    """Name of the motor that it is of."""
+    n_p: Annotated[int, Field(ge=1, le=100)]
+    """Pole pairs of the motor that it is of."""
+    k_t_n_m_a: Positive
+    """Torque constant of the motor that it is of, by which currents became torques."""
+    speed_rad_s: Positive | None = None
+    """Speed at which it was learned."""
+    laps: Annotated[int, Field(ge=0, le=10**9)] = 0
+    """Whole turns that it was learned from."""
+    residual_n_m: NonNegative | None = None
+    """What no harmonic explained, rms."""
+    orders: Annotated[list[Annotated[int, Field(ge=1, le=MOST_ORDER)]], Field(max_length=ORDERS)] = Field([])
+    """Periods in a turn of the shaft, ascending."""
+    cos_n_m: list[Finite] = Field([])
+    """Cosine coefficient of each order."""
+    sin_n_m: list[Finite] = Field([])
+    """Sine coefficient of each order."""
+    error_n_m: list[NonNegative] = Field([])
+    """Half of the 95 % interval of each order's coefficients."""
+
+    @model_validator(mode="after")
+    def _as_many(self) -> AnticoggingTable:
+        n = len(self.orders)
+        sizes = [len(row) for row in (self.cos_n_m, self.sin_n_m)]
+        if n == 0:
+            raise ValueError("orders: missing; learn it anew, or leave anticogging out")
+        if sizes != [n, n] or len(self.error_n_m) not in (0, n):
+            raise ValueError("orders, cos_n_m, sin_n_m and error_n_m must be of one length; learn it anew")
+        if any(a >= b for a, b in zip(self.orders, self.orders[1:], strict=False)):
+            raise ValueError("orders must ascend; learn it anew")
+        return self
+
+    @property
+    def known(self) -> Harmonics:
+        """As the law takes it."""
+        return Harmonics(tuple(self.orders), tuple(self.cos_n_m), tuple(self.sin_n_m))
