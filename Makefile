@@ -54,8 +54,9 @@ node: ## JavaScript packages for the tests that need node, into .cache/node (200
 gallery: $(STAMP) ## make the pictures of docs/gallery.md anew (needs Chromium)
 	$(BIN)/python docs/gallery/make.py
 
-reference: $(STAMP) ## make docs/reference-config.md and the files' schemas anew
+reference: $(STAMP) ## make docs/reference-config.md, the files' schemas and the viewers' layouts anew
 	$(BIN)/python -m hil.manual.page docs
+	$(BIN)/python -m hil.manual.layouts configs/layouts
 
 docs: $(STAMP) ## the documentation as a site in .cache/site, links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

@@ -47,10 +47,16 @@ def binned(ticks: TickArray, rate_hz: int) -> dict[str, list[float]]:
     return out
 
 
+def live_names(fields: Sequence[Field] = CURVES) -> list[str]:
+    """Names of the page's plots, in their order."""
+    found = dict.fromkeys(field.shown.live for field in fields if field.shown.live)
+    return sorted(found, key=(*LIVE, *found).index)
+
+
 def live_plots(fields: Sequence[Field] = CURVES) -> list[tuple[str, list[tuple[str, str]]]]:
     """Title with the unit, and the curves as (key, label), for each plot of the page."""
     plots: dict[str, list[tuple[str, str]]] = {}
-    for field in sorted(fields, key=lambda field: (*LIVE, field.shown.live).index(field.shown.live)):
+    for field in sorted(fields, key=lambda field: live_names(fields).index(field.shown.live)):
         unit = COMMAND_UNIT if field.shown.live == "command" else field.drawn_unit
         title = f"{field.shown.live} [{unit}]"
         plots.setdefault(title, []).append((field.name, field.name.removesuffix("_ns")))

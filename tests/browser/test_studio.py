@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib.image
 import pytest
 
+from hil.manual.layouts import panels
 from hil.runtime.setup import Overrides, load_setup
 from hil.sim.simulate import simulate
 from tests.browser.chromium import Browser, Page
@@ -16,7 +17,7 @@ from tests.browser.studio import studio
 from tests.conftest import CONFIGS
 from tests.node import MISSING, has_packages, modules
 
-TITLES = ("Speed [rad/s]", "Current [A]", "Voltage sent [V]", "Load torque [N m]", "Lateness [ns]")
+TITLES = tuple(panels())
 PATIENT_S = 240.0  # it is a big program
 LEGEND, MARKER = 128, 20  # height of title and legend, and pixels of a curve below them
 COLOUR = 0.15  # largest less smallest of red, green, blue: curves that lie on each other still have it

@@ -14,6 +14,8 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.reader import make_reader
 
+from hil.manual.layouts import layouts, panels
+from hil.signals import FIELDS, Field, Shown
 from tests.conftest import CONFIGS
 from tests.logfiles import some_frames, some_ticks, write_log
 
@@ -43,6 +45,19 @@ def test_every_layout_is_looked_at() -> None:
         "lichtblick-live.json",
         "plotjuggler.xml",
     }
+
+
+@pytest.mark.parametrize("name", list(layouts()))
+def test_the_layouts_are_made_of_the_fields_rows(name: str) -> None:
+    assert (LAYOUTS / name).read_text() == layouts()[name], "make reference"
+
+
+def test_a_new_signals_row_is_a_curve_of_its_panel() -> None:
+    loss = Field(
+        99, "p_loss", "f8", "W", "output", "copper loss", shown=Shown("p_loss", "copper", live="loss")
+    )
+    found = panels((*FIELDS, loss))
+    assert found["Loss [W]"] == [loss] and list(found)[:-1] == list(panels())
 
 
 @pytest.mark.parametrize("name", ["lichtblick", "lichtblick-live"])
