@@ -9,6 +9,9 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/closed_loop/test_current_drive.py
 NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.23.0 \
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
+# Two calls: first what may run beside others, then what has the machine for itself. Together they are all tests.
+MARKS := (not process or beside) and not alone
+PARALLEL := --numprocesses=auto --maxprocesses=4 --dist=loadscope --no-loadscope-reorder
 COVER := --cov=hil.control --cov=hil.tick.supervisor --cov=hil.tick.guard --cov=hil.tick.kernel --cov=drivers.codec --cov=drivers.e2e
 
 .PHONY: docs golden reference gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
@@ -32,10 +35,11 @@ lint: $(STAMP) ## ruff and mypy
 	$(BIN)/mypy
 
 quick: $(STAMP) lint ## before each commit: lint, types, the fast tests
-	$(BIN)/python -m pytest -q -m "not process and not vm and not slow" tests/unit tests/property tests/closed_loop
+	$(BIN)/python -m pytest -q $(PARALLEL) -m "$(MARKS) and not process and not slow" tests/unit tests/property tests/closed_loop
 
 unit: $(STAMP) ## all tests, compiled
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL) -m "$(MARKS)"
+	$(BIN)/python -m pytest -m "not ($(MARKS))"
 
 # The same kernels with the compiler off: line and branch coverage can see into them.
 interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage

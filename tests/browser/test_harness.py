@@ -8,6 +8,8 @@ import pytest
 
 from tests.browser.chromium import BrowserError, Page
 
+pytestmark = pytest.mark.alone
+
 CLEAN = """<!doctype html><title>clean</title>
 <style>body { margin: 0 } div { width: 200px; height: 100px }</style>
 <div id="pad" style="background: #f00"></div><script>

@@ -19,6 +19,8 @@ from hil.sim.simulate import simulate, simulate_ticks
 from tests.browser.chromium import Page
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.alone
+
 EVIL = "</script><script>window.ran = 1</script><img src=x onerror=window.ran=1>'\"<b id=evil>&amp;"
 
 

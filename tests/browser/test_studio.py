@@ -17,6 +17,8 @@ from tests.browser.studio import studio
 from tests.conftest import CONFIGS
 from tests.node import MISSING, has_packages, modules
 
+pytestmark = pytest.mark.alone
+
 TITLES = tuple(panels())
 PATIENT_S = 240.0  # it is a big program
 LEGEND, MARKER = 128, 20  # height of title and legend, and pixels of a curve below them

@@ -14,6 +14,8 @@ from drivers.errors import DatabaseError, NodeError
 from hil.runtime.configure import compare, configure
 from tests.canopen import NODE, durand_drive, job
 
+pytestmark = pytest.mark.alone
+
 Refused = (DatabaseError, NodeError)
 
 

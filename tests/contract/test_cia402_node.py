@@ -22,6 +22,8 @@ from hil.config.tables import load_toml
 from tests.canopen import EDS, NODE, emulated
 from tests.contract.test_drive_firmware import Wires
 
+pytestmark = pytest.mark.alone
+
 DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP, FAULT = 0x0040, 0x0021, 0x0033, 0x0037, 0x0017, 0x0008
 STATE_BITS = 0x7F
 WRONG_STATE, NO_MAPPING, TOO_LONG, OUT_OF_RANGE = 0x08000022, 0x06040041, 0x06040042, 0x06090030

@@ -19,6 +19,8 @@ from hil.errors import ConfigError, HilError
 from hil.runtime.configure import Result, compare, configure, lost
 from tests.canopen import EDS, NODE, bus_of, emulated, job, recorded, run_config, stranger
 
+pytestmark = pytest.mark.alone
+
 SDO_TO, SDO_FROM, NMT = 0x600 + NODE, 0x580 + NODE, 0x000
 
 

@@ -273,6 +273,7 @@ def test_a_flood_does_not_keep_the_watchdog_from_tripping(configs: Path) -> None
     )
 
 
+@pytest.mark.alone
 @pytest.mark.compiled  # real time: interpreted kernels are too slow for it
 def test_a_cyclic_drive_stands_still_until_its_first_command(configs: Path) -> None:
     bench = Bench(configs, clock="realtime", pacing="cyclic")
@@ -282,6 +283,7 @@ def test_a_cyclic_drive_stands_still_until_its_first_command(configs: Path) -> N
     assert bench.ids().count(0x181) > 3 and bench.node.state["t_ns"] == 0
 
 
+@pytest.mark.alone
 def test_a_cyclic_drive_keeps_its_own_time(configs: Path) -> None:
     bench = Bench(configs, clock="realtime", pacing="cyclic")
     bench.node.warm_up()

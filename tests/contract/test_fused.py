@@ -64,7 +64,7 @@ from tests.conftest import CONFIGS
 from tests.contract import virtual
 from tests.contract.virtual import TIME
 
-pytestmark = [pytest.mark.compiled, pytest.mark.process]
+pytestmark = [pytest.mark.compiled, pytest.mark.process, pytest.mark.beside]
 
 PERIOD_NS, TIMEOUT_NS, ANSWER_NS = 10_000_000, 5_000_000, 1_000_000
 TICKS = 90

@@ -251,6 +251,7 @@ def test_answers_that_the_bus_does_not_take_are_counted(wire: Wire) -> None:
     assert node.state["t_ns"] == PERIOD_NS
 
 
+@pytest.mark.alone
 def test_in_real_time_the_plant_moves_by_the_clock(wire: Wire) -> None:
     node, database = drive(wire.link, "demo.toml", clock="realtime")
     station, command = node._station, database.message("COMMAND")
@@ -281,6 +282,7 @@ def test_a_socket_that_fails_is_a_bus_that_is_down(wire: Wire) -> None:
     assert time.monotonic_ns() - begin_ns >= 10_000_000, "it waits a little and goes on"
 
 
+@pytest.mark.alone
 def test_a_busy_bus_does_not_keep_the_drive_from_its_stop(wire: Wire) -> None:
     """The compiled call ends with its time although frames go on coming."""
     node, _ = drive(wire.link, "demo.toml", clock="realtime")

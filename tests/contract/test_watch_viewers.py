@@ -15,6 +15,8 @@ from websockets.exceptions import InvalidStatus
 from hil.watch import web
 from hil.watch.web import MAX_VIEWERS, Web, start
 
+pytestmark = pytest.mark.alone
+
 SIZE, MESSAGES = 50_000, 2_000
 
 

@@ -90,6 +90,7 @@ def test_only_what_lies_in_the_span_counts(delay: tuple[int, int], found_ms: flo
     assert within_ms([], 0, 1) == 0.0
 
 
+@pytest.mark.alone
 def test_a_sleeper_that_was_kept_from_its_core_notes_how_long() -> None:
     with witness() as control:
         for sleeper in control.sleepers:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,20 +13,31 @@ import pytest
 from tests.vm.machine import ROOT, MachineError, run_in_machine
 
 REQUIRED = os.environ.get("HIL_REQUIRE_VM") == "1"
-FIGURES: list[str] = []
+FIGURE = "figure"
 
 
-@pytest.fixture(scope="session")
-def figures() -> list[str]:
-    """What a test puts here is shown at the end, also when all is well."""
-    return FIGURES
+@pytest.fixture
+def figure(record_property: Callable[[str, object], None]) -> Callable[[str], None]:
+    """Takes a line that is shown at the end, also when all is well."""
+    return lambda line: record_property(FIGURE, line)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Show the figures of the runs on SocketCAN."""
-    if FIGURES:
+    """Show the figures of the runs on SocketCAN, whichever process ran them."""
+    reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
+    lines = [line for one in reports for name, line in one.user_properties if name == FIGURE]
+    if lines:
         terminalreporter.section("SocketCAN")
-        terminalreporter.write_line("\n".join(FIGURES))
+        terminalreporter.write_line("\n".join(lines))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """On the host's own SocketCAN the tests are in real time; in the bench machine time is virtual."""
+    ours = [item for item in items if item.get_closest_marker("vm")]
+    if ours and host_has_can():
+        for item in ours:
+            item.add_marker("alone")
 
 
 def host_has_can() -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +30,11 @@ def of_bus(counted: dict[str, Any], name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", BUSES)
-def test_a_tick_is_within_its_budget(counted: dict[str, Any], name: str, figures: list[str]) -> None:
+def test_a_tick_is_within_its_budget(
+    counted: dict[str, Any], name: str, figure: Callable[[str], None]
+) -> None:
     bus = of_bus(counted, name)
-    figures.append(f"{name}: instructions a tick\n{table_of(bus, budget()[name])}")
+    figure(f"{name}: instructions a tick\n{table_of(bus, budget()[name])}")
     assert not (over := excess(name, bus)), over
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ def frames_of(path: Path) -> list[tuple[int, bytes]]:
     return [(can_id, data) for _, can_id, data in timed_frames_of(path)]
 
 
-def steady(run: Seen, name: str, figures: list[str]) -> None:
+def steady(run: Seen, name: str, figure: Callable[[str], None]) -> None:
     """The run went to its end, replays to the bit, and says what it cost."""
     assert run.result["returncode"] == 0, run.result
     result = run.result["run"]
@@ -59,7 +60,7 @@ def steady(run: Seen, name: str, figures: list[str]) -> None:
     late_us = run.log.ticks["lateness_ns"] * 1e-3
     p50, p99 = np.percentile(late_us, [50, 99])
     seconds = (run.log.ticks["t_ns"][-1] - run.log.ticks["t_ns"][0]) * 1e-9
-    figures.append(
+    figure(
         f"{name}: {result['ticks']} ticks, {result['skipped']} skipped, "
         f"{len(run.frames) / seconds:.0f} frames/s, "
         f"loop {result['processor_us'] * 1e3:.0f} instructions a tick in virtual time, "
@@ -96,23 +97,23 @@ def assert_nothing_after_the_stop(run: Seen) -> None:
 
 
 @pytest.mark.parametrize("name", ["vcan_two_processes", "kvaser_pair"])
-def test_a_run_between_two_processes(socketcan: Path, name: str, figures: list[str]) -> None:
-    steady(seen(socketcan, name), name, figures)
+def test_a_run_between_two_processes(socketcan: Path, name: str, figure: Callable[[str], None]) -> None:
+    steady(seen(socketcan, name), name, figure)
 
 
-def test_5_khz_in_time(socketcan: Path, figures: list[str]) -> None:
+def test_5_khz_in_time(socketcan: Path, figure: Callable[[str], None]) -> None:
     """99.9 % of the commands go out before the next deadline, the drive, candump and the log beside."""
     run = seen(socketcan, "vcan_5_khz")
-    steady(run, "vcan_5_khz", figures)
+    steady(run, "vcan_5_khz", figure)
     share = share_in_time(run.log.ticks, 5000)
-    figures.append(f"vcan_5_khz: {100 * share:.2f} % in time")
+    figure(f"vcan_5_khz: {100 * share:.2f} % in time")
     assert share >= 0.999
 
 
-def test_sync_by_the_kernel_keeps_its_grid(socketcan: Path, figures: list[str]) -> None:
+def test_sync_by_the_kernel_keeps_its_grid(socketcan: Path, figure: Callable[[str], None]) -> None:
     """Its timer starts anew after each expiry: unsteered it would be 3 us late in each period."""
     run = seen(socketcan, "vcan_kernel_sync")
-    steady(run, "vcan_kernel_sync", figures)
+    steady(run, "vcan_kernel_sync", figure)
     syncs = [frame for frame in run.log.frames if frame.can_id == 0x80 and not frame.received]
     stamps = np.array([frame.t_ns for frame in syncs[:2000]])
     assert [frame.data[0] for frame in syncs[:240]] == list(range(1, 241))
@@ -152,18 +153,18 @@ def test_the_kernels_sync_does_not_feed_the_watchdog(socketcan: Path) -> None:
     assert_nothing_after_the_stop(run)
 
 
-def test_64_byte_frames_on_vcan(socketcan: Path, figures: list[str]) -> None:
+def test_64_byte_frames_on_vcan(socketcan: Path, figure: Callable[[str], None]) -> None:
     run = seen(socketcan, "vcan_fd")
-    steady(run, "vcan_fd", figures)
+    steady(run, "vcan_fd", figure)
     fd = Database(CONFIGS / "drives" / "hil_pmsm_fd.dbc")
     by_id = {message.can_id: message for message in fd.messages.values()}
     assert {len(data) for can_id, data in run.frames if can_id in (0x181, 0x201)} == {64}
     assert all(by_id[can_id].valid(data) for can_id, data in run.frames)
 
 
-def test_another_makers_drive_by_configuration_alone(socketcan: Path, figures: list[str]) -> None:
+def test_another_makers_drive_by_configuration_alone(socketcan: Path, figure: Callable[[str], None]) -> None:
     run = seen(socketcan, "vcan_other_drive")
-    steady(run, "vcan_other_drive", figures)
+    steady(run, "vcan_other_drive", figure)
     assert {can_id for can_id, _ in run.frames} == {0x18FF1000, 0x18FF1002, 0x18FF10F0, 0x18FF1100}
     own = run.log.ticks[run.log.ticks["state"] == DriveState.OPERATION_ENABLED]
     assert len(own) > 1500 and np.abs(own["w"] - own["w_ref"])[-200:].max() < 5.0
