@@ -60,6 +60,7 @@ class DeadMan(StopRequest):
     """
 
     ramps = False
+    polled = True
 
     def __init__(self, fd: int, now_ns: Callable[[], int], hold_ns: int = HOLD_NS) -> None:
         self._fd, self._now_ns = fd, now_ns
@@ -76,15 +77,15 @@ class DeadMan(StopRequest):
         if not self._released and not self._held():
             self._released = True
             self.stop_once()
-        return self._value
+        return int(self._cell[0])
 
     @value.setter
     def value(self, new: int) -> None:
-        self._value = new
+        self._cell[0] = new
 
     def stop_once(self) -> None:
         """Ask for a stop, but leave a stop that was asked for already as it is."""
-        if self._value not in self.STOPS:
+        if self._cell[0] not in self.STOPS:
             self.stop()
 
     def _held(self) -> bool:

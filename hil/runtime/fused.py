@@ -1,11 +1,13 @@
-"""A tick as one compiled call: what :mod:`hil.runtime.loop` does with its ports, where nothing is unusual.
+"""Ticks as one compiled call: what :mod:`hil.runtime.loop` does with its ports, where nothing is unusual.
 
 Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
 long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
 ports. It has no rules of its own: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
 guard :func:`hil.tick.kernel.whole_at`; the command :func:`drivers.posix.command`; the records
 :func:`hil.log.push.push`; the guardian's words as :class:`hil.runtime.guardian.GuardedDrive` keeps them.
-At the first thing that is unusual it returns the stage that it reached, and the loop does the rest.
+At the first thing that is unusual it returns the stage that it reached, and the loop does the rest. Some
+ticks run in one call, without Python in between: what others may ask of a run meanwhile is memory that is
+looked at before each tick.
 """
 
 from __future__ import annotations
@@ -44,8 +46,9 @@ from drivers.posix import (
 from drivers.posix import HEARD as TAKEN
 from drivers.wire import STATE
 from hil.config.design import Machine
-from hil.log.push import push
+from hil.log.push import HEADER, NOWHERE, push
 from hil.log.recorder import Recorder
+from hil.log.ring import FAILED_AT
 from hil.runtime.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
 from hil.runtime.loop import (
     ARRIVED,
@@ -54,15 +57,20 @@ from hil.runtime.loop import (
     DECIDED,
     FRESH,
     HEARD,
+    LOST,
     MAX_NS,
     NEVER,
+    NEXT,
     NOT_BEGUN,
     QUEUE_MOST,
+    RAN,
     RECORDED,
     SENT,
+    STEER_EVERY,
     STOP,
     Pace,
     Plan,
+    StopRequest,
     Whole,
     is_due,
     missed,
@@ -90,9 +98,19 @@ _clock_nanosleep = _types.ExternalFunction(
 THREAD_CPUTIME, ABSOLUTE = 3, 1
 I8: Final = np.dtype(np.int64)
 
-RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, ROWS = range(12)
+(
+    RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, REQUEST, NUMBER,
+    ROWS,
+) = range(14)  # fmt: skip
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
-PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS, EVERY = range(6)
+PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS, EVERY, TOGETHER, FOLLOWS, PLANNED = range(9)
+TOGETHER_NS: Final = 8_000_000
+"""How long ticks go on without Python: a signal that comes while none of them waits is late by so much."""
+
+
+def together(period_ns: int, request: StopRequest) -> int:
+    """How many ticks one compiled call may run."""
+    return 1 if request.polled else max(1, TOGETHER_NS // period_ns)
 
 
 def whole_tick(
@@ -101,12 +119,16 @@ def whole_tick(
     machine: Machine,
     recorder: Recorder,
     plan: Plan,
+    request: StopRequest,
     pace: Pace,
+    number: memoryview | None = None,
     marks: Marks | None = None,
 ) -> Whole:
-    """The tick of a run on a socket, paced by SYNC or feedback in real time; another is the loop's alone.
+    """The ticks of a run on a socket, paced by SYNC or feedback in real time; others are the loop's alone.
 
     The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
+    ``number``: of the newest set-point that was asked for, in memory that outlives the run; no array of it
+    stays, which would keep it from being released.
     """
     ports = client.compiled()
     receive = None if ports is None else {"sync": ports.exchange, "feedback": ports.follow}.get(plan.pacing)
@@ -116,27 +138,32 @@ def whole_tick(
     timing = np.array(
         [
             plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None),
-            plan.every,
-        ]
+            plan.every, plan.together, plan.pacing == "feedback",
+        ],
+        np.int64,
     )  # fmt: skip
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks = np.zeros(0, np.int64) if marks is None else marks
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
-    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks, pace]
+    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks, pace, request.cell]
     rows = [place_of(table.reshape(-1), I8) for table in tables]
     rows += [place_of(array, TICK if array is recorder.record else I8) for array in arrays]
-    call = partial(_compiled(run_tick if plan.pacing == "sync" else run_followed), np.array(rows))
-    call.__dict__["alive"] = (client, machine, recorder, tables, arrays)  # the places are of them
+    asked = np.zeros(1, np.int64)
+    rows.append(place_of(asked if number is None else np.frombuffer(number, np.int64), I8))
+    call = partial(_compiled(), np.array(rows))
+    call.__dict__["alive"] = (client, machine, recorder, tables, arrays, asked)  # the places are of them
     return call
 
 
-def _compiled(kernel: Any) -> Callable[..., int]:
+def _compiled() -> Callable[..., int]:
     """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    known = {TIMES_AT: np.zeros(4, np.int64), PLAN: np.zeros(EVERY + 1, np.int64)}
+    sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEXT + 1, REQUEST: 1, NUMBER: 1}
+    known = {row: np.zeros(size, np.int64) for row, size in sizes.items()}
+    known[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
     for row, array in known.items():
         table[row] = place_of(array, I8)
-    compiled: Callable[..., int] = entry(kernel, table, 0, 0, 0, False)
+    compiled: Callable[..., int] = entry(run_ticks, table, 0, 0, False)
     return compiled
 
 
@@ -145,10 +172,10 @@ def new_marks() -> Marks:
     return np.zeros(LAST + 1, np.int64)
 
 
-def load(pacing: str) -> None:
+def load() -> None:
     """Compile it, or load it."""
     if COMPILED:
-        _compiled(run_tick if pacing == "sync" else run_followed)
+        _compiled()
 
 
 @jit
@@ -244,7 +271,7 @@ def hand_on(table: Any) -> None:
         state[0]["logged"] = 0
 
 
-@waiting
+@jit
 def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
     """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.loop` that it reached."""
     times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
@@ -310,7 +337,7 @@ def heard(table: Any, t: Any, k: int, deadline_ns: int, asked: int, count: int) 
     return deadline_ns
 
 
-@waiting
+@jit
 def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
     """:func:`run_tick` for a tick that begins when the drive's cyclic feedback comes."""
     times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
@@ -333,3 +360,41 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     if len(words) > 0:
         t["rx_flags"] |= guardian_flags(words)
     return conclude(table, ticks, heard(table, t, k, deadline_ns, asked, count), request)
+
+
+@jit
+def asked_at(table: Any, k: int) -> Any:
+    """What is asked of the supervisor in tick k; at the end of the run a stop, at least."""
+    asked = array_at(table, REQUEST, I8)[0]
+    return max(asked, STOP) if k >= array_at(table, PLAN, I8)[END] else asked
+
+
+@jit
+def news(table: Any) -> Any:
+    """A number that is another once a set-point was asked for or the writer has failed: both only grow."""
+    return array_at(table, NUMBER, I8)[0] + array_at(places_at(table, TICKS_IN), HEADER, I8)[FAILED_AT]
+
+
+@waiting
+def run_ticks(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
+    """Ticks from k on, the first at its deadline [ns], until one is left to the loop or Python has its turn.
+
+    Returns the stage of :mod:`hil.runtime.loop` that the last one reached; the pace says how many ran.
+    """
+    plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
+    before = news(table)
+    while True:
+        if plan[FOLLOWS] != 0:
+            stage = run_followed(table, k, deadline_ns, asked_at(table, k), log_failed)
+        else:
+            stage = run_tick(table, k, deadline_ns, asked_at(table, k), log_failed)
+        if stage > BEGUN:
+            t = array_at(table, TICK_AT, TICK)[0]
+            k, deadline_ns = int(t["k"]), int(t["t_ns"])
+            pace[LOST], pace[NEXT] = pace[LOST] + t["skipped"], k
+        if stage != RECORDED:
+            return stage
+        pace[RAN], pace[NEXT] = pace[RAN] + 1, k + 1
+        if pace[RAN] >= plan[TOGETHER] or k % STEER_EVERY == 0 or news(table) != before:
+            return RECORDED
+        k, deadline_ns = k + 1, deadline_ns + plan[PERIOD_NS]

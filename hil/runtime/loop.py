@@ -21,13 +21,15 @@ from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickAr
 
 Pacing = Literal["sync", "feedback", "timer"]
 Step = Callable[[TickArray], None]
-Whole = Callable[[int, int, int, bool], int]
-"""A whole tick in one compiled call, as far as it goes: its number, deadline [ns], the request, whether the
-log failed; see :mod:`hil.runtime.fused`. It returns the stage that it reached."""
+Whole = Callable[[int, int, bool], int]
+"""Whole ticks in one compiled call, as far as they go: the first one's number, its deadline [ns], whether the
+log failed; see :mod:`hil.runtime.fused`. It returns the stage that the last one reached."""
 Pace = npt.NDArray[np.int64]
 """ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many a compiled tick has taken
-of a queue that it left to the loop; SINCE: periods from the last tick with feedback to the one before."""
-ARRIVED, HEARD, SINCE = range(3)
+of a queue that it left to the loop; SINCE: periods from the last tick with feedback to the one before. Of the
+last compiled call: RAN: ticks that it recorded; LOST: periods that it skipped; NEXT: number of the tick to go
+on with."""
+ARRIVED, HEARD, SINCE, RAN, LOST, NEXT = range(6)
 NOT_BEGUN, BEGUN, DECIDED, SENT, RECORDED = range(5)
 """Stages of a tick: SYNC is not out; SYNC is out, the drive has feedback to conclude; the law has run; the
 command is out, where there is one; the record is stored. What is left is done here."""
@@ -64,14 +66,30 @@ def wait_ns(plan: Plan, timed: bool) -> int:
 
 
 class StopRequest:
-    """What the operator asks: nothing, a stop (first Ctrl-C, SIGTERM) or a quick stop (second)."""
+    """What the operator asks: nothing, a stop (first Ctrl-C, SIGTERM) or a quick stop (second).
+
+    ``cell`` holds it for compiled ticks.
+    """
 
     ramps = True
     """Whether a stop lets the reference ramp to 0 first, as the config says."""
+    polled = False
+    """Whether :attr:`value` has to be read in each tick for something to be found out."""
     STOPS = (int(Request.STOP), int(Request.QUICK_STOP))
 
     def __init__(self) -> None:
-        self.value = int(Request.ARM)
+        self.cell = np.zeros(1, np.int64)
+        self._cell: Any = self.cell.data  # an item of it costs half of one of the array's
+        self._cell[0] = int(Request.ARM)
+
+    @property
+    def value(self) -> int:
+        """The request of this moment."""
+        return int(self._cell[0])
+
+    @value.setter
+    def value(self, new: int) -> None:
+        self._cell[0] = new
 
     def stop(self, *_: object) -> None:
         """Ask for a stop; asked twice, for a quick stop. Safe as a signal handler."""
@@ -83,7 +101,8 @@ class StopRequest:
 class Plan:
     """Timing of a run: period and feedback timeout [ns], pacing, length in ticks (None: until stopped).
 
-    ``every``: ticks from one feedback to the next.
+    ``every``: ticks from one feedback to the next. ``together``: ticks that one compiled call may run; a
+    signal that comes while none of them waits is late by so much.
     """
 
     period_ns: int
@@ -91,6 +110,7 @@ class Plan:
     pacing: Pacing
     ticks: int | None
     every: int = 1
+    together: int = 1
 
 
 @dataclass(slots=True)
@@ -107,10 +127,10 @@ class Outcome:
 
 def new_pace() -> Pace:
     """All zero."""
-    return np.zeros(SINCE + 1, np.int64)
+    return np.zeros(NEXT + 1, np.int64)
 
 
-def none_compiled(_k: int, _deadline_ns: int, _asked: int, _log_failed: bool) -> int:
+def none_compiled(_k: int, _deadline_ns: int, _log_failed: bool) -> int:
     """Every tick is left to the loop."""
     return NOT_BEGUN
 
@@ -167,8 +187,8 @@ class Loop:
 
     It is prepared when it is made: that sends nothing and takes longer than many ticks.
 
-    ``whole`` makes, for the prepared drive and the loop's pace, the tick in which nothing is unusual; what
-    that leaves is done by the rules here, which are its own.
+    ``whole`` makes, for the prepared drive and the loop's pace, the ticks in which nothing is unusual; what
+    they leave is done by the rules here, which are its own.
     """
 
     def __init__(
@@ -214,32 +234,28 @@ class Loop:
         return self._outcome
 
     def _run(self) -> None:
-        outcome, period_ns, recorder = self._outcome, self._plan.period_ns, self._recorder
-        tick, whole, compiled = self._tick, self._whole, self._whole is not none_compiled
-        follows = self._plan.pacing == "feedback"
+        period_ns, tick, whole, pace = self._plan.period_ns, self._tick, self._whole, self._pace
+        compiled = whole is not none_compiled
         start_ns = self._start_ns = self._clock.now_ns()
         if self._timed is not None:
             self._timed.start()
         k = 0
         while True:
-            deadline_ns = start_ns + k * period_ns
-            stage = whole(k, deadline_ns, self._asked(k), recorder.failed) if compiled else NOT_BEGUN
-            if follows and stage > BEGUN:
-                k, deadline_ns = self._followed()
+            stage = NOT_BEGUN
+            if compiled:
+                self._asked(k)  # a set-point that waits, and what has to be polled
+                pace[RAN], pace[LOST], pace[NEXT] = 0, 0, k
+                stage = whole(k, start_ns + k * period_ns, self._recorder.failed)
+                self._outcome.ticks += pace[RAN]
+                self._outcome.skipped += pace[LOST]
+                k = pace[NEXT]
             if stage != RECORDED:
-                k = self._rest(stage, tick, k, deadline_ns)
-            outcome.ticks += 1
+                k = self._rest(stage, tick, k, start_ns + k * period_ns) + 1
+                self._outcome.ticks += 1
             if self._ended:
                 return
-            if self._timed is not None and not k % STEER_EVERY:
-                self._timed.steer(k, start_ns + k * period_ns)
-            k += 1
-
-    def _followed(self) -> tuple[int, int]:
-        """k and deadline of a compiled tick that feedback woke: it may have skipped periods."""
-        t = self._cells
-        self._outcome.skipped += t.skipped[0]
-        return t.k[0], t.t_ns[0]
+            if self._timed is not None and not (k - 1) % STEER_EVERY:
+                self._timed.steer(k - 1, start_ns + (k - 1) * period_ns)
 
     def _asked(self, k: int) -> int:
         """What is asked of the supervisor; at the end of the run a stop, at least."""

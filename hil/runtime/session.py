@@ -7,7 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -87,7 +87,7 @@ def compile_kernels(setup: Setup) -> None:
     fac = setup.config.controller.kind == "fac"
     opens = drive_kind(setup.config.drive.kind).open
     precompile(setup.database, setup.binding.map, fac, new_ticks()[0], opens)
-    fused.load(plan_of(setup.config).pacing)
+    fused.load()
 
 
 def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) -> RunResult:
@@ -177,11 +177,13 @@ def _recorded(
         if watch:
             recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
         machine, plan = setup.machine.fresh(), plan_of(config)
+        plan = replace(plan, together=fused.together(plan.period_ns, request))
         machine = machine if request.ramps else machine.at_once()
         alone = watch is not None or clock.name != "monotonic"
-        whole = no_whole if alone else partial(fused.whole_tick, client, words, machine, recorder, plan)
         takes = set_by_others(setup)
         with contextlib.closing(Inbox(machine, takes)) as inbox, _started(None if watch else client):
+            compiled = partial(fused.whole_tick, client, words, machine, recorder, plan, request)
+            whole = no_whole if alone else partial(compiled, number=inbox.number)
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()

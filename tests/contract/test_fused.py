@@ -31,7 +31,8 @@ from drivers.local import CLASSIC, pack_frame
 from hil.log.check import first_broken
 from hil.log.reader import Log, open_log
 from hil.log.recorder import Recorder, open_recorder
-from hil.runtime import fused
+from hil.log.ring import FAILED_AT
+from hil.runtime import fused, inbox
 from hil.runtime.clock import RealClock
 from hil.runtime.guardian import (
     BEAT_NS,
@@ -42,11 +43,13 @@ from hil.runtime.guardian import (
     Words,
 )
 from hil.runtime.header import header_of
+from hil.runtime.inbox import Inbox, ranges
 from hil.runtime.loop import (
     BEGUN,
     DECIDED,
     NOT_BEGUN,
     RAMP_EVENT,
+    RAN,
     RECORDED,
     SENT,
     Loop,
@@ -67,7 +70,7 @@ from tests.contract.virtual import TIME
 pytestmark = [pytest.mark.compiled, pytest.mark.process, pytest.mark.beside]
 
 PERIOD_NS, TIMEOUT_NS, ANSWER_NS = 10_000_000, 5_000_000, 1_000_000
-TICKS = 90
+TICKS, TOGETHER = 90, 7
 PATIENT_NS = 10_000_000_000
 """A period in real time: no host is late by that."""
 STATES = {0x0: 1, 0x6: 2, 0x7: 3, 0xF: 4}
@@ -82,6 +85,8 @@ class Drive:
         self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
         self.counter = self._echo = self._state = self._beats = self._deaf_until = 0
         self.operator, self.speed = StopRequest(), 0.0
+        self.inbox: Inbox
+        self.recorder: Recorder
         self.heard: list[int] = []
         self._then: list[Callable[[], None]] = []
 
@@ -382,6 +387,24 @@ def fired(drive: Drive, n: int) -> None:
     calm(drive, n)
 
 
+@now_and_then(45)
+def asked_for_a_speed(drive: Drive, n: int) -> None:
+    """Another process asks for a set-point while the loop waits: the next tick takes it."""
+    cells = drive.inbox.cells
+    w = int(np.float64(1.5).view(np.int64))
+    cells[inbox.HAS], cells[inbox.W], cells[inbox.I_Q] = 1, w, 0
+    cells[inbox.CHECK] = inbox._check(1, 1, w, 0)
+    cells[inbox.ASKED] = 1
+    calm(drive, n)
+
+
+@now_and_then(45)
+def writer_fails(drive: Drive, n: int) -> None:
+    """The writer says so while the loop waits: the next tick knows it."""
+    drive.recorder._ticks.header[FAILED_AT] = 1
+    calm(drive, n)
+
+
 def guardian_dies(drive: Drive, n: int) -> None:
     if n >= 60:
         drive.words.cells[GUARD_NS] -= GUARDIAN_LOST_NS + 10**9
@@ -394,6 +417,8 @@ class Ran:
 
     path: Path
     stages: Counter[int]
+    together: list[int]
+    """Ticks that each compiled call recorded."""
     heard: list[int]
     ended: str
     words: list[int]
@@ -430,10 +455,11 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
     setup, act = setup_of(*settings), TABLES[case[0]][case[1]][0]
     request = StopRequest()
     stages: Counter[int] = Counter()
+    together: list[int] = []
     words, machine = Words(), setup.machine.fresh()
     words.cells[GUARD_NS] = TIME.now_ns
     pacing = setup.config.loop.pacing
-    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
+    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS, together=TOGETHER)
     recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
     recorder.await_open()
     failure = ""
@@ -445,11 +471,14 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         client = DriveClient(link, setup.database, on_frames=recorder.frames, timed=sync)
 
         def counted(pace: Pace) -> Whole:
-            made = fused.whole_tick(client, words, machine, recorder, plan, pace)
+            parts = client, words, machine, recorder, plan, request, pace, page.number
+            made = fused.whole_tick(*parts)
 
             def whole(*args: Any) -> int:
                 stage = made(*args)
-                stages[stage] += 1
+                stages[RECORDED] += int(pace[RAN])
+                stages[stage] += stage != RECORDED
+                together.append(int(pace[RAN]))
                 return stage
 
             return whole
@@ -457,8 +486,9 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         guarded, record = GuardedDrive(client, words, time.monotonic_ns, sync), recorder.record
         whole = counted if compiled else no_whole
         parts = guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole
-        loop = Loop(*parts, timed=sync)
-        drive.operator = request
+        page = Inbox(machine, ranges(machine, "cascade"))
+        loop = Loop(*parts, page, sync)
+        drive.operator, drive.inbox, drive.recorder = request, page, recorder
         TIME.restart()  # kernels that were compiled meanwhile have waited
         drive.begin()
         try:
@@ -468,10 +498,11 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         finally:
             drive.stop()
             recorder.close({"ended": "in time"})
+            page.close()
     if TIME.trouble:
         raise TIME.trouble[0]
     ended = Reason(outcome.reason).name
-    return Ran(path, stages, drive.heard, ended, words.cells.tolist()[:5], failure)
+    return Ran(path, stages, together, drive.heard, ended, words.cells.tolist()[:5], failure)
 
 
 def assert_same(rules: Ran, compiled: Ran) -> None:
@@ -531,6 +562,8 @@ CASES: dict[str, tuple[Act, set[int], str]] = {
     "the queue is full": (deaf, {SENT, BEGUN, NOT_BEGUN, DECIDED}, "SEND_FAILED"),
     "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
     "the guardian dies": (guardian_dies, {SENT}, "GUARDIAN_LOST"),
+    "a set-point": (asked_for_a_speed, {SENT}, "STOP_REQUESTED"),
+    "the writer fails": (writer_fails, {SENT}, "LOG_FAILED"),
 }
 
 
@@ -572,7 +605,11 @@ def test_a_compiled_tick_is_the_loops_own(name: str, both: Both) -> None:
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     assert name not in EXACT or set(compiled.stages) - {RECORDED} == left, compiled.stages
     assert compiled.ended == ended
-    assert not rules.stages
+    assert not rules.stages and max(compiled.together) == TOGETHER
+    if name == "a set-point":
+        ticks = compiled.log.ticks
+        (taken,) = [event["k"] for event in compiled.log.events if event["kind"] == "set-point"]
+        assert taken == 46 and ticks["w_ref"].max() == 1.5
 
 
 FOLLOWED: dict[str, tuple[Act, set[int], str]] = {
@@ -601,6 +638,7 @@ def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, both: B
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     assert compiled.stages[NOT_BEGUN] == 1 or ended in ("SEND_FAILED", "GUARDIAN")
+    assert max(compiled.together) == TOGETHER
     assert (BEGUN in compiled.stages) == (BEGUN in left)
     assert compiled.ended == ended and not rules.stages
 
@@ -630,7 +668,7 @@ def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, both: B
     rules, compiled = both(("by the kernel", name), 'loop.pacing="feedback"')
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
-    assert compiled.ended == ended and not rules.stages
+    assert compiled.ended == ended and not rules.stages and max(compiled.together) == TOGETHER
     stale = compiled.log.ticks["rx_flags"] & int(RxFlag.FRESH) == 0
     assert stale.any() == (name in ("no feedback", "no SYNC", "late feedback") or ended == "GUARDIAN")
     syncs = [frame for frame in compiled.log.frames if frame.can_id == SYNC and not frame.received]
@@ -640,14 +678,14 @@ def test_a_compiled_tick_by_the_kernels_sync_is_the_loops_own(name: str, both: B
 @pytest.fixture
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A client, its compiled tick and the other end of the wire, without a loop."""
-    setup, words = setup_of(), Words()
+    setup, words, request = setup_of(), Words(), StopRequest()
     machine, plan = setup.machine.fresh(), Plan(PATIENT_NS, TIMEOUT_NS, "sync", TICKS)
     recorder = open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "monotonic"), 1000)
     with ends() as (ours, theirs):
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
         client.prepare(recorder.record[0])
-        whole = fused.whole_tick(client, words, machine, recorder, plan, new_pace())
-        yield Parts(whole, words, recorder.record, theirs)
+        whole = fused.whole_tick(client, words, machine, recorder, plan, request, new_pace())
+        yield Parts(whole, words, recorder.record, theirs, request)
         recorder.close({})
 
 
@@ -659,6 +697,7 @@ class Parts:
     words: Words
     record: TickArray
     end: socket.socket
+    request: StopRequest
 
     def silent(self) -> bool:
         """Nothing was sent, nothing stored."""
@@ -669,13 +708,13 @@ class Parts:
 
 def test_a_tick_that_is_late_by_a_period_is_the_loops(parts: Parts) -> None:
     before = parts.record.tobytes()
-    assert parts.whole(7, time.monotonic_ns() - PATIENT_NS, 1, False) == NOT_BEGUN
+    assert parts.whole(7, time.monotonic_ns() - PATIENT_NS, False) == NOT_BEGUN
     assert parts.silent() and parts.record.tobytes() == before
 
 
 def test_nothing_is_sent_once_the_guardian_has_fired(parts: Parts) -> None:
     parts.words.cells[FIRED] = 1
-    assert parts.whole(7, time.monotonic_ns(), 1, False) == NOT_BEGUN
+    assert parts.whole(7, time.monotonic_ns(), False) == NOT_BEGUN
     assert parts.silent() and parts.words.cells[BEAT_NS] > 0
 
 
@@ -686,7 +725,7 @@ def test_a_signal_ends_the_sleep(parts: Parts) -> None:
     try:
         signal.setitimer(signal.ITIMER_REAL, 0.05)
         begin_ns = time.monotonic_ns()
-        assert parts.whole(7, begin_ns + 20 * 10**9, 1, False) == NOT_BEGUN
+        assert parts.whole(7, begin_ns + 20 * 10**9, False) == NOT_BEGUN
     finally:
         signal.signal(signal.SIGALRM, before)
     assert seen == [signal.SIGALRM] and time.monotonic_ns() - begin_ns < 10 * 10**9
@@ -695,7 +734,8 @@ def test_a_signal_ends_the_sleep(parts: Parts) -> None:
 
 def test_a_tick_sleeps_to_its_deadline(parts: Parts) -> None:
     deadline_ns = time.monotonic_ns() + 30_000_000
-    parts.whole(7, deadline_ns, 3, True)
+    parts.request.value = Request.STOP
+    parts.whole(7, deadline_ns, True)
     assert CLASSIC.unpack(parts.end.recv(128))[0] == SYNC
     tick = parts.record[0]
     assert (tick["k"], tick["t_ns"], tick["request"], tick["log_failed"]) == (7, deadline_ns, 3, 1)
@@ -716,6 +756,7 @@ def test_what_has_no_sync_or_no_socket_is_the_loops(tmp_path: Path, channel: str
             client = DriveClient(link, setup.database)
             client.prepare(recorder.record[0])
             plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
-            assert fused.whole_tick(client, None, machine, recorder, plan, new_pace()) is none_compiled
+            parts = client, None, machine, recorder, plan, StopRequest(), new_pace()
+            assert fused.whole_tick(*parts) is none_compiled
     other.close()
     recorder.close({})

@@ -54,25 +54,27 @@ def test_a_tick_leaves_nothing_behind(tmp_path: Path, channel: str, compiled: bo
     status = setup.database.message("STATUS")
     statuses = [status.encode({"Counter": k, "DcLinkVoltage": 540.0}) for k in range(16)]
     seen: list[tuple[int, int]] = []
+    request = StopRequest()
     plan, step = Plan(1_000_000, 800_000, "sync", TICKS), machine.looped()
     count = left = 0
 
     def looked(pace: Pace) -> Whole:
-        made = fused.whole_tick(client, None, machine, recorder, plan, pace) if compiled else none_compiled
+        parts = client, None, machine, recorder, plan, request, pace
+        made = fused.whole_tick(*parts) if compiled else none_compiled
 
-        def whole(k: int, deadline_ns: int, asked: int, log_failed: bool) -> int:
+        def whole(k: int, deadline_ns: int, log_failed: bool) -> int:
             nonlocal count, left
             count += 1
             if len(seen) < 2 and k >= (SETTLED, TICKS - 10)[len(seen)]:  # a busy host skips ticks
                 seen.append((gc.get_count()[0], sys.getallocatedblocks()))
-            stage = made(k, deadline_ns, asked, log_failed)
+            stage = made(k, deadline_ns, log_failed)
             left += stage == NOT_BEGUN
             return stage
 
         return whole
 
     drive = answering(peer, answers, statuses)
-    loop = Loop(client, clock, recorder, step, recorder.record, plan, StopRequest(), looked)
+    loop = Loop(client, clock, recorder, step, recorder.record, plan, request, looked)
     gc.collect()
     gc.disable()
     try:
