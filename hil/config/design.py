@@ -22,6 +22,7 @@ from hil.control.errors import ControlDesignError
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
+from hil.control.regen import RegenLimit
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speedfilter import MOST_AVERAGE
 from hil.log.named import to_named
@@ -230,6 +231,14 @@ def known_cogging(config: RunConfig) -> Harmonics | None:
     return known
 
 
+def regen_limit(limits: LimitsTable) -> RegenLimit | None:
+    """What may go back to the DC link."""
+    if limits.p_regen_max_w is None:
+        return None
+    ends = (limits.v_dc_regen_from_v or math.inf, limits.v_dc_regen_max_v or math.inf)
+    return RegenLimit(limits.p_regen_max_w, *ends)
+
+
 def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
     """The law's tuning. Raises ControlDesignError only when designed. ``told``: the drive reports i_q."""
     controller, observer = config.controller, config.observer
@@ -244,6 +253,7 @@ def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
         T_L_max=config.limits.T_L_max_n_m,
         coupling=controller.compensate_coupling,
         cogging=known_cogging(config),
+        regen=regen_limit(config.limits),
         more=_values(controller),
     )
 

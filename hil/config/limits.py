@@ -39,6 +39,13 @@ class LimitsTable(Table):
     """DC link below which the run ends (DC_LINK_UNDER_VOLTAGE)."""
     v_dc_max_v: Positive = 1e4
     """DC link above which the run ends (DC_LINK_OVER_VOLTAGE)."""
+    p_regen_max_w: NonNegative | None = None
+    """Largest power that the law lets the motor give back to the DC link, by its model in steady state: it
+    brakes with less current then, and more slowly than the reference may ask. Left out: no such limit."""
+    v_dc_regen_from_v: Positive | None = None
+    """DC link from which p_regen_max_w falls, to 0 at v_dc_regen_max_v; left out: it does not."""
+    v_dc_regen_max_v: Positive | None = None
+    """DC link to which nothing is given back any more; below v_dc_max_v."""
     temperature_max_c: Annotated[float, Field(ge=-273.15, le=1e4, allow_inf_nan=False)] = 120.0
     """Temperature of motor or inverter above which the run ends (OVER_TEMPERATURE)."""
     i_continuous_a: Positive | None = None
@@ -75,6 +82,23 @@ class LimitsTable(Table):
             raise ValueError("i_trip_a must be above i_max_a, or normal operation trips")
         if self.v_dc_max_v <= self.v_dc_min_v:
             raise ValueError("v_dc_max_v must be above v_dc_min_v")
+        return self
+
+    @model_validator(mode="after")
+    def _regenerating(self) -> LimitsTable:
+        start, end = self.v_dc_regen_from_v, self.v_dc_regen_max_v
+        if (start is None) != (end is None):
+            raise ValueError("v_dc_regen_from_v and v_dc_regen_max_v belong together; give both or neither")
+        if start is None or end is None:
+            return self
+        if self.p_regen_max_w is None:
+            raise ValueError(
+                "v_dc_regen_max_v needs p_regen_max_w, the power that falls from v_dc_regen_from_v; add it"
+            )
+        if not start < end < self.v_dc_max_v:
+            raise ValueError(
+                "v_dc_regen_from_v < v_dc_regen_max_v < v_dc_max_v must hold, or braking trips the run"
+            )
         return self
 
 

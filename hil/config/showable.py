@@ -20,12 +20,14 @@ EITHER_SIGN: Final = (
 )
 ABOVE: Final = (
     ("v_dc_max_v", "v_dc"),
+    ("v_dc_regen_max_v", "v_dc"),
     ("temperature_max_c", "temperature_motor"),
     ("temperature_max_c", "temperature_inverter"),
 )
 NEEDED: Final = (
     ("v_dc_min_v", ("v_dc",)),
     ("v_dc_max_v", ("v_dc",)),
+    ("v_dc_regen_max_v", ("v_dc",)),
     ("temperature_max_c", ("temperature_motor", "temperature_inverter")),
 )
 """Limits that need one of these signals; only what the configuration itself sets is judged."""

@@ -28,6 +28,7 @@ from hil.control.jit import jit
 from hil.control.linalg import Array, copy, exp, matvec, matvec_add
 from hil.control.mtpa import operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
+from hil.control.regen import RegenLimit, braked, regen_params
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
 from hil.control.speed import COMMANDS, ask_speed
 from hil.control.speedfilter import PAST, ROOM, behind, filter_params, hear, innovation, ticks_of
@@ -125,6 +126,10 @@ LAW_PARAMS: Final = np.dtype(
         ("cog_lead", "f8"),
         ("cog_lag", "f8"),
         ("cog_slow", "f8"),
+        ("regen", "i8"),
+        ("p_regen", "f8"),
+        ("v_regen", "f8"),
+        ("g_regen", "f8"),
     ],
     align=True,
 )
@@ -136,7 +141,8 @@ from ``k_u`` on the drive's own current loop and the speed law's gains (:mod:`hi
 adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are in ``g``; R_s and the share of
 the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to the next where these are
 several, else 0, and ``span``: what an innovation rests on then, where there is a filter; from ``cogs`` on the
-load torque that is known over the shaft's angle (:mod:`hil.control.cogging`)."""
+load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); from ``regen`` on what may go
+back to the DC link (:mod:`hil.control.regen`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -146,8 +152,9 @@ _FILTER = ("order", "v_y", "v_u", "v_s", "w_y", "w_u", "w_s", "w_d", "gap_y")
 _SALIENT = ("R_s", "u_share")
 _SELDOM = ("every", "span")
 _COGGING = ("cogs", "cog_order", "cog_a", "cog_b", "cog_lead", "cog_lag", "cog_slow")
+_REGEN = ("regen", "p_regen", "v_regen", "g_regen")
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING), 0.0
+    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING, *_REGEN), 0.0
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -200,6 +207,7 @@ LAW_STATE: Final = np.dtype(
         ("i_d_ref", "f8"),
         ("capped", "i8"),
         ("theta", "f8"),
+        ("v_dc", "f8"),
     ],
     align=True,
 )
@@ -208,7 +216,8 @@ LAW_STATE: Final = np.dtype(
 of a drive's own current loop what flows, and the commands on their way, newest first; of a filtered speed
 rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
-whether the torque asked for was capped; the measured angle of the shaft, where a load over it is known."""
+whether what was asked for was capped; the measured angle of the shaft, where a load over it is known, and the
+measured DC link, where it limits."""
 
 Record = npt.NDArray[np.void]
 
@@ -286,6 +295,8 @@ class LawSpec:
     """The drive's own current loop; None for a drive that takes voltages."""
     cogging: Harmonics | None = None
     """The load torque that is known over the shaft's angle."""
+    regen: RegenLimit | None = None
+    """What may go back to the DC link."""
 
     def values(self) -> dict[str, Any]:
         """What the registered design takes."""
@@ -460,7 +471,7 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
     if spec.inner and spec.inner.every > 1:
         values["every"] = spec.inner.every
     gain = spec.inner.k_u / motor.J if spec.inner else 0.0
-    values |= cog_params(spec.cogging, *_lead(spec, values, T_s), T_s)
+    values |= cog_params(spec.cogging, *_lead(spec, values, T_s), T_s) | regen_params(spec.regen, motor.R_s)
     for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
         params[name] = value
     for name in ("form", "third", "g", "M", "W", "S", "short", "first"):
@@ -638,9 +649,18 @@ def asked_current(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
 
 @jit
 def speed_law(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
-    """:func:`asked_current`, limited to i_max."""
-    i_q_ref = asked_current(p, s, w_ref, dw_ref)
-    return float(min(max(i_q_ref, -p["i_max"]), p["i_max"]))
+    """:func:`asked_current`, limited to i_max and by what may go back to the DC link."""
+    return limited_current(p, s, s["x_p"][0], asked_current(p, s, w_ref, dw_ref))
+
+
+@jit
+def limited_current(p: Any, s: Any, w: float, i_q: float) -> float:
+    """i_q within i_max, and within what may go back to the DC link at the speed w; i_d* = 0."""
+    i_q = float(min(max(i_q, -p["i_max"]), p["i_max"]))
+    if not p["regen"]:
+        return i_q
+    s["capped"] = 0
+    return float(braked(p, s, p["n_p"] * w, 0.0, i_q))
 
 
 @jit
@@ -686,7 +706,8 @@ def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> Non
     reluctance = (p["L_d"] - p["L_q"]) * s["x_p"][2] * s["x_p"][1]
     tau = psi_f * asked_current(p, s, w_ref, dw_ref) + reluctance
     i_d_ref, i_q_ref, capped = operating_point(p, tau, w, steady_room(p, s, w, u_limit))
-    s["i_d_ref"], s["i_q_ref"], s["capped"] = i_d_ref, i_q_ref, int(capped)
+    s["capped"] = int(capped)
+    s["i_d_ref"], s["i_q_ref"] = i_d_ref, braked(p, s, w, i_d_ref, i_q_ref) if p["regen"] else i_q_ref
     current_law(p, s)
     s["u"][2] += (1.0 - p["lam_d"]) * i_d_ref / p["Bd"][2, 2]
 
@@ -695,10 +716,10 @@ def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> Non
 def fac_law(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float) -> None:
     """u = Bd^-1 (x* + Z e^{Upsilon T_s} Z^-1 (x_p - x*) - Ad x_p - Ed d_p), x* = (w*, i_q*, 0).
 
-    i_q* is limited to i_max, T_L to T_L_max.
+    i_q* is limited to i_max and by what may go back to the DC link, T_L to T_L_max.
     """
     free_response(p, s)
-    i_q_ref = min(max(i_q_ref, -p["i_max"]), p["i_max"])
+    i_q_ref = limited_current(p, s, s["x_p"][0], i_q_ref)
     s["i_q_ref"] = i_q_ref
     target = w_ref + p["T_s"] * dw_ref
     e_w, e_q, e_d = s["x_p"][0] - target, s["x_p"][1] - i_q_ref, s["x_p"][2]
@@ -719,7 +740,7 @@ def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
     asked = k_p[0] * e_w + total[0] + p["J"] * dw_ref / p["k_t"]
     if p["cogs"]:
         asked -= p["J"] * ahead(p, s) / p["k_t"]
-    i_q_ref = min(max(asked, -p["i_max"]), p["i_max"])
+    i_q_ref = limited_current(p, s, x[0], asked)
     total[0] += p["T_s"] * k_i[0] * (e_w + (i_q_ref - asked) / k_p[0])
     s["i_q_ref"] = i_q_ref
     psi_f = p["k_t"] / (1.5 * p["n_p"])
@@ -747,7 +768,7 @@ def identify_law(p: Any, s: Any, w_ref: float) -> None:
         return
     if over:
         s["row"] = p["rows"]
-    s["i_q_ref"] = torque_step(p, s)
+    s["i_q_ref"] = fed_back(p, s, torque_step(p, s))
     current_law(p, s)
 
 
@@ -756,8 +777,14 @@ def identify_speed(p: Any, s: Any, w_ref: float) -> None:
     """:func:`identify_law` for a drive with a current loop of its own: the row's current is the command."""
     if w_ref != p["w_run"] or abs(s["x"][0]) > p["goal"][0]:
         s["row"] = p["rows"]
-    s["i_q_ref"] = torque_step(p, s)
+    s["i_q_ref"] = fed_back(p, s, torque_step(p, s))
     s["u"][0], s["u"][1], s["u"][2] = 0.0, s["i_q_ref"] * p["u_i"], 0.0
+
+
+@jit
+def fed_back(p: Any, s: Any, i_q: float) -> float:
+    """A row's current, no more than may go back to the DC link."""
+    return limited_current(p, s, s["x"][0], i_q) if p["regen"] else i_q
 
 
 @jit
@@ -875,6 +902,6 @@ def is_saturated(p: Any, s: Any, u_limit: float) -> bool:
     u_q, u_d = s["u"][1], s["u"][2]
     if u_q * u_q + u_d * u_d >= u_limit * u_limit or abs(s["i_q_ref"]) >= p["i_max"]:
         return True
-    if p["kind"] == MTPA:
-        return bool(s["capped"] != 0)
+    if (p["kind"] == MTPA or p["regen"]) and s["capped"] != 0:
+        return True
     return bool(p["kind"] == FAC and abs(s["u"][0]) >= p["T_L_max"])

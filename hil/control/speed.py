@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from hil.control.cogging import ripple
 from hil.control.jit import jit
+from hil.control.regen import braked
 from hil.control.speedfilter import enter
 
 MOST_DELAY: Final = 8
@@ -96,5 +97,9 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     sigma = s["x_p"][0] + kappa * s["x_p"][1]
     wanted = after + holds + p["lam_w"] * (sigma - target - held)
     u = (wanted - a * sigma - drift) / p["g_u"]
-    s["u"][0], s["u"][1], s["u"][2] = 0.0, u, 0.0
     s["i_q_ref"] = min(max(u / p["u_i"], -p["i_max"]), p["i_max"])
+    if p["regen"]:
+        s["capped"] = 0
+        s["i_q_ref"] = braked(p, s, p["n_p"] * s["x_p"][0], 0.0, s["i_q_ref"])
+        u = s["i_q_ref"] * p["u_i"] if s["capped"] else u
+    s["u"][0], s["u"][1], s["u"][2] = 0.0, u, 0.0

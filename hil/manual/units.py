@@ -43,6 +43,7 @@ UNITS: Final = {
     "_v": "V",
     "_c": "degC",
     "_j": "J",
+    "_w": "W",
 }
 """Ends of names, each before those that it ends in itself."""
 

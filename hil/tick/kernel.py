@@ -140,6 +140,8 @@ def control(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> Any:
         t["i_q_ref"], t["i_d_ref"] = ls["i_q_ref"], ls["i_d_ref"]
         return s["u_q"], s["u_d"], s["T_L"], 0
     limit = circle(p, s, lp, t)
+    if lp["regen"]:
+        ls["v_dc"] = t["v_dc"]
     ask(lp, ls, t["w_ref"], t["dw_ref"], t["i_q_ref_in"], limit)
     note_asked(ls, t)
     s["i_d_ref"] = ls["i_d_ref"]
