@@ -34,6 +34,8 @@ class PlantMotor(Table):
     """Inductance L_d of the d axis."""
     L_q_h: Positive
     """Inductance L_q of the q axis."""
+    L_q_saturation_a: Positive | None = None
+    """Current i_q at which psi_q / i_q has fallen to half of L_q_h by saturation; left out: none."""
     psi_f_wb: Positive
     """Flux linkage psi_f of the magnets: peak phase voltage over electrical speed."""
     n_p: Annotated[int, Field(ge=1, le=100)]

@@ -21,6 +21,7 @@ from firmware_model.friction import exponential, level, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import held_load, varying_load
 from firmware_model.plant import ANGLE, DRIVE, SLIDE
+from firmware_model.saturation import begin_flux, bend, current_of
 from firmware_model.series import ORDER, evaluate, integral, products
 
 
@@ -65,9 +66,15 @@ def series(
     w[0], q[0], d[0] = x[0], x[1], x[2]
     added = held(p, m, held_load(p, t + 0.5 * h) + T_commanded, u_q, u_d)
     slide, T_coulomb = (c[SLIDE, 0], level(p, t + 0.5 * h)) if p["rubs"] else (1.0, 0.0)
+    saturates = p["L_q_saturation"] > 0.0
+    if saturates:
+        begin_flux(p, c)
     for k in range(ORDER):
         share = 1.0 / (k + 1)
         dw, dq, dd = slopes(m, w, q, d, k)
+        if saturates:
+            bent_w, bent_d = bend(m, c, k)
+            dw, dd = dw + bent_w, dd + bent_d
         if p["varying"]:
             dw -= varying_load(p, c, t, k) * inverse_J
         if k == 0:
@@ -79,6 +86,8 @@ def series(
             dw *= abs(slide)
         w[k + 1] = dw * share
         q[k + 1], d[k + 1] = (dq * share, dd * share) if on else (0.0, 0.0)
+        if saturates:
+            q[k + 1] = current_of(p, c, q[k + 1], k + 1)
 
 
 @jit

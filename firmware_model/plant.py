@@ -25,7 +25,9 @@ DRIVE, STRIBECK, LINK, INVERSE, POWER, ANGLE = range(SLIDE + 1, SLIDE + 7)
 shaft's angle, whose coefficient 0 is the state itself."""
 QUADRATURE: Final = ANGLE + 1
 """First of the rows, one a load, for the quarter turn ahead of a load that goes by the angle."""
-ROWS: Final = QUADRATURE + MAX_LOADS
+FLUX, SQUARE, EXCESS = range(QUADRATURE + MAX_LOADS, QUADRATURE + MAX_LOADS + 3)
+"""Rows of a saturated q axis: phi = psi_q / L_q, its square, i_q - phi (:mod:`firmware_model.saturation`)."""
+ROWS: Final = EXCESS + 1
 PROTOCOL_VERSION: Final = 1
 
 
@@ -117,10 +119,16 @@ def _speed_filter(firmware: Any) -> dict[str, float]:
     return {}
 
 
+def _varies(config: Any) -> bool:
+    """True for what the series without rows of its own has no room for."""
+    return config.motor.L_q_saturation_a is not None or has(config, "coefficient") or has(config, "angular")
+
+
 PARAMETERS: Final = {
     "R_s": Parameter(lambda c, w: c.motor.R_s_ohm, "ohm"),
     "L_d": Parameter(lambda c, w: c.motor.L_d_h, "H"),
     "L_q": Parameter(lambda c, w: c.motor.L_q_h, "H"),
+    "L_q_saturation": Parameter(lambda c, w: c.motor.L_q_saturation_a or 0.0, "A"),
     "psi_f": Parameter(lambda c, w: c.motor.psi_f_wb, "Wb"),
     "n_p": Parameter(lambda c, w: c.motor.n_p),
     "J": Parameter(lambda c, w: c.motor.J_kg_m2, "kg m2"),
@@ -149,7 +157,7 @@ PARAMETERS: Final = {
     "status_every": Parameter(lambda c, w: c.firmware.status_every, "", "i8"),
     "seed": Parameter(lambda c, w: c.seed, "", "i8"),
     "loads": Parameter(lambda c, w: len(c.all_loads), "", "i8"),
-    "varying": Parameter(lambda c, w: has(c, "coefficient") or has(c, "angular"), "", "i8"),
+    "varying": Parameter(lambda c, w: _varies(c), "", "i8"),
     "turns": Parameter(lambda c, w: has(c, "angular") or w.theta_lsb > 0.0, "", "i8"),
     "rubs": Parameter(lambda c, w: c.friction.most_n_m > 0.0 or has(c, "level"), "", "i8"),
     "coulomb": Parameter(lambda c, w: c.friction.coulomb_n_m, "N m"),
@@ -178,10 +186,11 @@ PARAMETERS: Final = {
 """Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
 
 ``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported. ``turns``: the angle is kept. ``varying``: a
-load changes within a substep; ``rubs`` 0: no friction, no brake; ``capacitance`` 0: the DC link stays at
-v_dc, which else is the rectifier's no-load voltage. ``takes``: what a command is (:class:`Takes`); gains and
-shares of reset are those of the sampled current loop; ``filter`` is of the speed (:class:`Filter`), with its
-poles, or the samples of a mean and their period.
+load changes within a substep, or the q axis saturates (``L_q_saturation`` 0: not); ``rubs`` 0: no friction,
+no brake; ``capacitance`` 0: the DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a
+command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop; ``filter`` is
+of the speed (:class:`Filter`), with its poles, or the samples
+of a mean and their period.
 """
 _NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
 LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)

@@ -16,6 +16,7 @@ from firmware_model.link import advance_held_link, advance_link
 from firmware_model.load import held_load, load_torque
 from firmware_model.motor import rubbed_series, series
 from firmware_model.plant import ANGLE, DRIVE, POWER, SLIDE, STRIBECK
+from firmware_model.saturation import flux_of
 from firmware_model.series import ORDER, evaluate, first_crossing, integral, within
 
 W_ERROR = 1e-10
@@ -31,6 +32,8 @@ def drive_torque(p: Any, s: Any, t: float) -> float:
     """Torque on the shaft without friction [N m], at t [s]."""
     x = s["x"]
     electric = 1.5 * p["n_p"] * (p["psi_f"] + (p["L_d"] - p["L_q"]) * x[2]) * x[1]
+    if p["L_q_saturation"] > 0.0:
+        electric += 1.5 * p["n_p"] * p["L_q"] * (x[1] - flux_of(p, x[1])) * x[2]
     load = load_torque(p, t, x[0], s["series"][ANGLE, 0]) + s["T_commanded"]
     return float(electric - p["B_f"] * x[0] - load + p["J"] * p["phi_w"])
 

@@ -31,6 +31,7 @@ def refuse_uncoupled(plants: dict[str, PlantConfig]) -> None:
     for name, plant in plants.items():
         has = {
             "friction": plant.friction.most_n_m > 0.0,
+            "motor.L_q_saturation_a": plant.motor.L_q_saturation_a is not None,
             "a load that only holds (brake)": any(load.kind == "brake" for load in plant.load),
             "inverter.capacitance_f": bool(plant.inverter.capacitance_f),
             "fault": bool(plant.fault),

@@ -32,6 +32,8 @@ class IdentifiedTable(Table):
     """Noise of the measured speed, resolution included, standard deviation."""
     i_noise_a: NonNegative | None = None
     """Noise of the measured currents, resolution included, standard deviation."""
+    L_q_saturation_a: Positive | None = None
+    """Current i_q at which psi_q / i_q has fallen to half of L_q_h by saturation; left out: none was seen."""
     delay_ticks: Annotated[int, Field(ge=0, le=100)] | None = None
     """Ticks from sending a voltage to its effect."""
 
