@@ -11,7 +11,7 @@ from hil.api.setups import File
 from hil.log.reader import Log
 from hil.report.build import Report
 from hil.report.build import build as build_report
-from hil.report.collect import Run, collect
+from hil.report.collect import Run, collect_nodes, named
 from hil.report.criteria import figures
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def metrics(log: Log | File) -> dict[str, float | None]:
 
     The unit ends the name. None: the run does not show it, as a recovery without a load step.
     """
-    return figures(_seen(log))
+    return figures(_seen(log, alone=True)[0])
 
 
 def plot(*logs: Log | File, path: File | None = None) -> Figure:
@@ -35,7 +35,7 @@ def plot(*logs: Log | File, path: File | None = None) -> Figure:
     """
     from hil.report.picture import figure
 
-    drawn = figure([_seen(log) for log in logs])
+    drawn = figure([run for log in logs for run in _seen(log, alone=len(logs) == 1)])
     if path is not None:
         drawn.savefig(path)
     return drawn
@@ -51,13 +51,13 @@ def report(*logs: File, path: File) -> Report:
     return build_report([Path(log) for log in logs], Path(path), sections=identification)
 
 
-def _seen(log: Log | File) -> Run:
-    """What a report knows of a log, without its replay."""
+def _seen(log: Log | File, *, alone: bool) -> list[Run]:
+    """What a report knows of a log, without its replay; of a file with several nodes, of each."""
     if not isinstance(log, Log):
-        return collect(Path(log), verify=False)
+        return named(collect_nodes(Path(log), verify=False), alone=alone)
     run = Run(log, log.path.stem)
     for begin in range(0, len(log.ticks), BLOCK):
         run.feed(log.ticks[begin : begin + BLOCK])
     with np.errstate(invalid="ignore", over="ignore"):
         run.responses.finish()
-    return run
+    return [run]

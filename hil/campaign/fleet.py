@@ -21,7 +21,7 @@ from hil.config.tables import RunConfig, load_toml
 from hil.errors import HilError
 from hil.log.parts import grouped
 from hil.replay.whatif import COMPARED, what_if
-from hil.report.collect import collect
+from hil.report.collect import collect_nodes
 from hil.report.criteria import FIGURES, figures, judge
 
 LOGS_A_BATCH: Final = 8
@@ -82,12 +82,13 @@ class FleetJob:
 
 
 def _judged(paths: tuple[Path, ...]) -> Row:
-    """Replay and figures of a run."""
-    run = collect(paths)
-    missed = [check for check in judge(run) if check.outcome != "pass"]
-    why = "; ".join(f"{check.name}: {check.found}" for check in missed)
-    head: Row = {"verdict": run.verdict.verdict, "ended": run.ended, "passed": not missed, "why": why}
-    return head | figures(run)
+    """Replay and figures of a run; of one with several nodes the worst verdict, and the first's figures."""
+    runs = collect_nodes(paths)
+    missed = [(run.node, check) for run in runs for check in judge(run) if check.outcome != "pass"]
+    why = "; ".join(f"{node} {check.name}: {check.found}".lstrip() for node, check in missed)
+    worst = max(runs, key=lambda run: run.verdict.exit_code).verdict
+    head: Row = {"verdict": worst.verdict, "ended": runs[0].ended, "passed": not missed, "why": why}
+    return head | figures(runs[0])
 
 
 def _tried(paths: tuple[Path, ...], config: Path) -> Row:

@@ -15,13 +15,15 @@ def register(commands: Commands) -> None:
         "export",
         cmd_export,
         "Write LOG in another format, by the ending of FILE: ticks as .parquet .csv .mat .mf4, "
-        "frames as .log (candump) .asc .blf, .mf4 with --frames.",
+        "frames as .log (candump) .asc .blf, .mf4 with --frames. Of a run with several nodes ticks of each: "
+        "those of the first are FILE, others have their names before the ending.",
     )
     command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a log, or the parts of one run")
     command.add_argument("-o", "--output", type=Path, metavar="FILE", required=True)
     command.add_argument(
         "--frames", action="store_true", help="the frames, where FILE may hold either (.mf4)"
     )
+    command.add_argument("--node", default="", metavar="NAME", help="the ticks of this node alone, as FILE")
     command.add_argument("--force", action="store_true", help="replace FILE when it exists")
     command = commands.add(
         "import",
@@ -40,16 +42,20 @@ def register(commands: Commands) -> None:
 
 def cmd_export(args: argparse.Namespace) -> int:
     """Write a log in another format."""
-    from hil.exchange.export import FORMATS, export
+    from hil.exchange.export import FORMATS, export_nodes
     from hil.report.view import key_values, show
 
     if args.output.suffix.lower() in FORMATS:
         output_file(args.output, *FORMATS)
-    found = export(one_run(args.logs), args.output, frames=args.frames, force=args.force).as_dict()
+    options = {"frames": args.frames, "force": args.force, "node": args.node}
+    made = export_nodes(one_run(args.logs), args.output, **options)
+    found = {name: one.as_dict() for name, one in made.items()}
     if args.json:
-        print_json(found)
+        first = next(iter(found.values()))
+        print_json(first | ({"nodes": found} if len(found) > 1 else {}))
     else:
-        show(key_values("hil export", found))
+        for name, one in found.items():
+            show(key_values(f"hil export {name}".rstrip(), one))
     return 0
 
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+from typing import TYPE_CHECKING, Any
 
 from hil.commands.common import Commands, print_json, say
+
+if TYPE_CHECKING:
+    from hil.watch.look import Look
 
 WEB_PORT, FOXGLOVE_PORT = 8080, 8765
 OPEN = (
@@ -31,6 +35,12 @@ def register(commands: Commands) -> None:
     )
 
     command.add_argument(
+        "--node",
+        default="",
+        metavar="NAME",
+        help="of a run with several nodes the one to see (default: the first; --foxglove has all)",
+    )
+    command.add_argument(
         "--open",
         action="store_true",
         help="with --foxglove, whose protocol has no password: let every program and page here read the run",
@@ -45,31 +55,42 @@ def _port(text: str) -> int:
     raise argparse.ArgumentTypeError(f"{text!r} must be a port, 0 to 65535")
 
 
+def _seen(look: Look) -> dict[str, Any]:
+    """The figures of a run as JSON; of one with several nodes each one's, too."""
+    from hil.watch.look import Look, figures
+
+    entry, nodes = look.entry, {}
+    for name in entry.nodes:
+        with contextlib.closing(Look(entry, name)) as own:
+            nodes[name] = figures(own, own.latest(entry.rate_hz))
+    run = {"pid": entry.pid, "bus": entry.bus, "log": entry.log}
+    return figures(look, look.latest(entry.rate_hz)) | run | ({"nodes": nodes} if nodes else {})
+
+
 def cmd_watch(args: argparse.Namespace) -> int:
     """Watch a run."""
     from hil.runtime.registry import WatchError, choose
     from hil.watch import terminal
-    from hil.watch.look import Look, figures
+    from hil.watch.look import Look
 
     if args.web:
         from hil.watch import web
 
-        web.run(args.run_name, WEB_PORT if args.port is None else args.port, say)
+        web.run(args.run_name, WEB_PORT if args.port is None else args.port, say, args.node)
         return 0
     if args.foxglove:
         from hil.watch import stream
 
+        if args.node:
+            raise WatchError(f"--foxglove: has the ticks of all nodes; leave out --node {args.node}")
         if not args.open:
             raise WatchError(OPEN)
         stream.run(args.run_name, FOXGLOVE_PORT if args.port is None else args.port, say)
         return 0
-    look = Look(choose(args.run_name))
+    look = Look(choose(args.run_name), args.node)
     try:
         if args.json:
-            ticks = look.latest(look.entry.rate_hz)
-            print_json(
-                {**figures(look, ticks), "pid": look.entry.pid, "bus": look.entry.bus, "log": look.entry.log}
-            )
+            print_json(_seen(look))
         elif args.once:
             terminal.once(look)
         else:

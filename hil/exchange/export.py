@@ -14,6 +14,7 @@ import numpy as np
 from hil.exchange.recordings import Asc, Blf, Candump, Mf4Recording
 from hil.exchange.tables import CsvTable, MatTable, Mf4Table, ParquetTable
 from hil.log.errors import LogError
+from hil.log.info import info_of
 from hil.log.reader import Log, Source, new_log, read_blocks
 from hil.log.schema import Records
 
@@ -81,10 +82,40 @@ def replacing(out: Path, *, force: bool) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def export(source: Source, out: Path, *, frames: bool = False, force: bool = False) -> Exported:
+def _names(source: Source) -> tuple[str, ...]:
+    """The nodes of a run with several."""
+    return tuple(info_of((source,) if isinstance(source, Path) else source).nodes)
+
+
+def outputs(source: Source, out: Path, node: str = "") -> dict[str, Path]:
+    """Each node's file: the first's is ``out``, another one's has its name before the ending.
+
+    Of a run of one drive, and for frames, which are the bus's, there is one; of a ``node`` just its own.
+    """
+    nodes = () if node else _names(source)
+    if not nodes or FORMATS.get(out.suffix.lower(), ("frames",))[0] == "frames":
+        return {node: out}
+    return {nodes[0]: out} | {name: out.with_name(f"{out.stem}.{name}{out.suffix}") for name in nodes[1:]}
+
+
+def export_nodes(
+    source: Source, out: Path, *, frames: bool = False, force: bool = False, node: str = ""
+) -> dict[str, Exported]:
+    """:func:`export` of each node, or of ``node``, by its name; nothing is written where one can't be."""
+    files = {node: out} if frames else outputs(source, out, node)
+    for path in files.values():
+        if path.exists() and not force:
+            raise LogError(f"{path}: exists already; --force replaces it")
+    return {name: export(source, path, frames=frames, force=force, node=name) for name, path in files.items()}
+
+
+def export(
+    source: Source, out: Path, *, frames: bool = False, force: bool = False, node: str = ""
+) -> Exported:
     """Write the log ``source`` as ``out``; the ending names the format. Raises LogError.
 
-    ``frames``: the frames, where the ending can stand for them and for ticks.
+    ``frames``: the frames, where the ending can stand for them and for ticks. ``node``: of a run with several
+    nodes the one whose ticks these are; empty: the first.
     """
     kind = out.suffix.lower()
     if kind not in FORMATS:
@@ -92,7 +123,9 @@ def export(source: Source, out: Path, *, frames: bool = False, force: bool = Fal
     holds, opened = ("frames", FRAMES_OF[kind]) if frames and kind in FRAMES_OF else FORMATS[kind]
     if frames and holds != "frames":
         raise LogError(f"{out}: {kind} holds ticks; frames go to .log .asc .blf .mf4")
-    log = new_log(source)
+    if node and holds == "frames":
+        raise LogError(f"{out}: the frames are those of all nodes; leave out --node {node}")
+    log = new_log(source, "" if node in _names(source)[:1] else node)
     with replacing(out, force=force) as part:
         count = _stream(log, part, holds, opened)
     return Exported(str(out), holds, count, out.stat().st_size, log.damage)

@@ -54,7 +54,7 @@ def _estimated(runs: Sequence[Run]) -> Estimate:
         raise HilError("they differ in loop.rate_hz, n_p or what the drive takes")
     if sum(run.totals.ticks for run in runs) > MOST_TICKS:
         raise HilError(f"more than {MOST_TICKS} ticks; hil identify --from takes them")
-    ticks = [open_log(run.log.parts or run.log.path, frames=False).ticks for run in runs]
+    ticks = [open_log(run.log.parts or run.log.path, frames=False, node=run.node).ticks for run in runs]
     return estimate_for(configs[-1], configs[-1].motor, ticks)
 
 

@@ -11,8 +11,9 @@ from typing import IO, Any
 from mcap.records import AttachmentIndex, Channel, Metadata, MetadataIndex, Statistics
 
 from hil.log.errors import DamagedError, LogError
-from hil.log.reader import Log, check_format, read_blocks
+from hil.log.reader import Log, check_format, nodes_named, read_blocks, result_of
 from hil.log.scan import parse
+from hil.log.schema import node_topic
 from hil.log.summary import all_indexed, record_at, summary
 from hil.signals import new_ticks
 
@@ -36,6 +37,18 @@ class Info:
         return int(self.metadata.get("run", {}).get("format", "1"))
 
     @property
+    def nodes(self) -> dict[str, dict[str, Any]]:
+        """Of a run with several nodes each one's ticks and how it ended, by its name; else empty."""
+        names = nodes_named(self.metadata)
+        ends = result_of(self.metadata).get("nodes")
+        own = ends if isinstance(ends, dict) else {}
+        topics = dict(zip(names, ("/tick", *map(node_topic, names[1:])), strict=True))
+        return {
+            name: {"ticks": self.counts.get(topic, 0)} | dict(own.get(name, {}))
+            for name, topic in topics.items()
+        }
+
+    @property
     def written_by(self) -> str:
         """Version and commit of the writer."""
         run = self.metadata.get("run", {})
@@ -55,7 +68,7 @@ class Info:
             "result": self.metadata.get("result", {}),
             "attachments": self.attachments,
             "damage": self.damage,
-        }
+        } | ({"nodes": self.nodes} if self.nodes else {})
 
 
 def info_of(paths: Sequence[Path]) -> Info:
@@ -129,6 +142,9 @@ def _from_blocks(path: Path) -> Info:
             received = int((records["received"] != 0).sum())
             counts["/can/rx"] += received
             counts["/can/tx"] += len(records) - received
+    for node in log.nodes[1:]:
+        blocks = read_blocks(Log(path, new_ticks(0), node=node))
+        counts[node_topic(node)] = sum(len(block.records) for block in blocks if block.kind == "ticks")
     counts["/event"] = log.event_count
     return Info(
         path=path,

@@ -70,6 +70,20 @@ class Block(NamedTuple):
     records: Records
 
 
+def nodes_named(metadata: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+    """Names of the nodes of a run with several, the first first; none for a run with one."""
+    return tuple(filter(None, metadata.get("nodes", {}).get("names", "").split(",")))
+
+
+def result_of(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """The run's result; empty for a run cut short."""
+    try:
+        out = json.loads(metadata.get("result", {}).get("result", "{}"))
+    except ValueError:
+        return {}
+    return out if isinstance(out, dict) else {}
+
+
 @dataclass(slots=True)
 class Log:
     """A run's log as far as it can be read. ``damage`` is None for a complete file."""
@@ -98,12 +112,7 @@ class Log:
     @property
     def result(self) -> dict[str, Any]:
         """The run's result, of a node after the first with what is its own; empty for a run cut short."""
-        try:
-            out = json.loads(self.metadata.get("result", {}).get("result", "{}"))
-        except ValueError:
-            return {}
-        if not isinstance(out, dict):
-            return {}
+        out = result_of(self.metadata)
         nodes = out.get("nodes")
         own = nodes.get(self.node) if self.node and isinstance(nodes, dict) else None
         return out | own if isinstance(own, dict) else out
@@ -111,7 +120,7 @@ class Log:
     @property
     def nodes(self) -> tuple[str, ...]:
         """Names of the nodes of a run with several, the first first; none for a run with one."""
-        return tuple(filter(None, self.metadata.get("nodes", {}).get("names", "").split(",")))
+        return nodes_named(self.metadata)
 
     def __enter__(self) -> Self:
         return self

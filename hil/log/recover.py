@@ -52,11 +52,18 @@ def recover(path: Path, out: Path) -> Recovery:
 
 def _begin(log: Log, out: Path) -> RunFile:
     run = log.metadata.get("run", {})
-    file = RunFile(out, {"metadata": run, "attachments": log.attachments}, absent=log.absent)
+    header = {"metadata": run, "attachments": log.attachments, "nodes": list(log.nodes[1:])}
+    header["more"] = {name: log.metadata[name] for name in _of_nodes(log) if name in log.metadata}
+    file = RunFile(out, header, absent=log.absent)
     if "part" in log.metadata:
         file.add_metadata("part", log.metadata["part"])
     file.add_metadata("recovered", {"from": log.path.name, "damage": log.damage or "none"})
     return file
+
+
+def _of_nodes(log: Log) -> tuple[str, ...]:
+    """What the metadata of a run with several nodes are called."""
+    return ("nodes", *(f"run of {node}" for node in log.nodes[1:])) if log.nodes else ()
 
 
 def _copy(log: Log, file: RunFile, out: Path) -> Recovery:
@@ -66,6 +73,10 @@ def _copy(log: Log, file: RunFile, out: Path) -> Recovery:
             file.add_ticks(records)
         else:
             file.add_frames(records)
+    for node in log.nodes[1:]:
+        for kind, records in read_blocks(Log(log.path, new_ticks(0), node=node)):
+            if kind == "ticks":
+                file.add_ticks(records, node)
     for event in log.events:
         file.add_event(event["t_ns"], event["k"], event["kind"], event["text"])
     recovery = Recovery(out, file.ticks, file.frames, len(log.events), log.last_t_ns, log.damage)

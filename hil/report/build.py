@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from hil.errors import HilError
 from hil.log.reader import Source
-from hil.report.collect import Run, collect
+from hil.report.collect import Run, collect_nodes, named
 from hil.report.criteria import figures, judge, notes, open_loop
 from hil.report.page import page
 from hil.report.section import Section, Sections, no_more
@@ -39,6 +39,7 @@ class Report:
             "runs": [
                 {
                     "log": str(run.log.path),
+                    **({"node": run.node} if run.node else {}),
                     "ticks": run.totals.ticks,
                     "checks": [check.as_dict() for check in judge(run)],
                     "figures": figures(run),
@@ -66,7 +67,11 @@ def build(
         raise HilError(f"{len(logs)} logs: a report compares at most {MOST_LOGS}; name fewer")
     if not out.parent.is_dir():
         raise HilError(f"{out.parent}: no such folder; make it, or choose another file with -o")
-    runs = [collect(source, verify=verify) for source in logs]
+    runs = [
+        run for source in logs for run in named(collect_nodes(source, verify=verify), alone=len(logs) == 1)
+    ]
+    if len(runs) > MOST_LOGS:
+        raise HilError(f"{len(runs)} nodes: a report compares at most {MOST_LOGS}; name fewer logs")
     names = [run.name for run in runs]
     for index, run in enumerate(runs):
         run.name = f"{run.name} ({index + 1})" if names.count(names[index]) > 1 else run.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -102,6 +103,16 @@ class Run:
         return [(int(row), STOP_WEIGHT) for row in np.nonzero(changed)[0]]
 
     @property
+    def node(self) -> str:
+        """Which of several nodes on a bus it is; empty for a run of one drive."""
+        return self.log.node
+
+    @property
+    def follows(self) -> bool:
+        """False for a commanded torque: its speed reference means nothing, so there is no error to show."""
+        return self.config is None or self.config.controller.kind != "torque"
+
+    @property
     def rate_hz(self) -> float:
         """Ticks a second, by the config or else by the ticks."""
         if self.config is not None:
@@ -157,9 +168,28 @@ class Run:
         ]
 
 
-def collect(source: Source, *, verify: bool = True) -> Run:
-    """Read a log, and replay it when ``verify``. Raises LogError for what is no log of hil."""
-    log = new_log(source)
+def one_log(runs: Sequence[Run]) -> bool:
+    """True for the nodes of one run: they share time, frames and events."""
+    nodes = {run.node for run in runs}
+    return len(runs) == len(nodes) > 1 and "" not in nodes and len({run.log.path for run in runs}) == 1
+
+
+def collect_nodes(source: Source, *, verify: bool = True) -> list[Run]:
+    """:func:`collect` of a run of one drive, or of each node of a run with several."""
+    first = collect(source, verify=verify)
+    return [first, *(collect(source, verify=verify, node=node) for node in first.log.nodes[1:])]
+
+
+def named(runs: list[Run], *, alone: bool) -> list[Run]:
+    """Nodes get their names; ``alone``: no other log is beside theirs."""
+    for run in runs:
+        run.name = f"{'' if alone else run.name + ' '}{run.node}" if run.node else run.name
+    return runs
+
+
+def collect(source: Source, *, verify: bool = True, node: str = "") -> Run:
+    """Read a log, and replay it when ``verify``; ``node``: one after the first. Raises LogError."""
+    log = new_log(source, node)
     run, again, more = Run(log, log.path.stem), Replay(log), verify
     for block in read_blocks(log):
         if not len(block.records):
@@ -173,6 +203,7 @@ def collect(source: Source, *, verify: bool = True) -> Run:
         run.responses.finish()
     if run.config is None and not run.config_problem:  # there was no tick
         run.read_config()
+    log.node = node or next(iter(log.nodes), "")
     if verify:
         run.verdict = again.verdict()
     return run

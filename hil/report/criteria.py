@@ -40,8 +40,18 @@ class Figure:
 
 
 def _worst(name: str) -> Callable[[Run], float | None]:
-    """Worst of all responses; infinite when one never came to rest."""
-    return lambda run: float("inf") if name in run.responses.unfinished else run.responses.worst.get(name)
+    """Worst of all responses; infinite when one never came to rest, none where no speed is followed."""
+
+    def read(run: Run) -> float | None:
+        never = float("inf") if name in run.responses.unfinished else None
+        return (never or run.responses.worst.get(name)) if run.follows else None
+
+    return read
+
+
+def _followed(name: str) -> Callable[[Run], float | None]:
+    """A figure of how a speed reference was followed."""
+    return lambda run: getattr(run.totals, name) if run.follows else None
 
 
 def _dip(run: Run) -> float | None:
@@ -56,7 +66,7 @@ def _recovery(run: Run) -> float | None:
 
 def untold(run: Run) -> bool:
     """True for a log without the true load: dip and recovery come from estimate and reference."""
-    return run.totals.ticks > 0 and not run.excursions.truth
+    return run.follows and run.totals.ticks > 0 and not run.excursions.truth
 
 
 def notes(run: Run) -> dict[str, str]:
@@ -91,7 +101,7 @@ def _busiest(run: Run) -> float | None:
 
 
 FIGURES: Final = (
-    Figure("tracking_rms_rad_s", "tracking error, rms", "rad/s", lambda run: run.totals.tracking_rms),
+    Figure("tracking_rms_rad_s", "tracking error, rms", "rad/s", _followed("tracking_rms")),
     Figure("dip_rad_s", "worst dip after a load step", "rad/s", _dip),
     Figure("recovery_s", "slowest recovery to 0.5 rad/s", "s", _recovery),
     Figure("rise_s", "slowest rise, 10 to 90 %", "s", _worst("rise_s")),
@@ -99,7 +109,7 @@ FIGURES: Final = (
     Figure("settling_s", "slowest settling to 2 %", "s", _worst("settling_s")),
     Figure("estimate_error_n_m", "load estimate off N ticks after a step", "N m", _worst("estimate_error")),
     Figure("ripple_rad_s", "speed ripple at rest, rms", "rad/s", _worst("ripple")),
-    Figure("iae_rad", "integral of |w − w*|", "rad", lambda run: run.totals.iae),
+    Figure("iae_rad", "integral of |w − w*|", "rad", _followed("iae")),
     Figure("skipped", "periods skipped", "", lambda run: run.totals.skipped),
     Figure("dropped", "records dropped", "", _result("dropped_ticks")),
     Figure("lost_feedback", "ticks in operation without fresh feedback", "", lambda run: run.totals.lost),

@@ -108,12 +108,13 @@ OF_VOLTAGES: Final = ("voltage_d", "d_i")
 """Plots of what a drive that takes a current or a torque does not have."""
 
 
-def plots_of(config: RunConfig | None) -> tuple[Plot, ...]:
-    """The plots of a run: of a drive with a current loop the command is no voltage."""
-    if config is None or config.drive.takes == "voltage":
+def plots_of(*configs: RunConfig | None) -> tuple[Plot, ...]:
+    """The plots of runs: of drives with a current loop the command is no voltage."""
+    takes = {config.drive.takes: config.command.unit for config in configs if config is not None}
+    if not takes or "voltage" in takes:
         return PLOTS
-    title = f"{config.drive.takes}: asked by the law, sent, in effect".capitalize()
-    unit = config.command.unit
+    name = next(iter(takes)) if len(takes) == 1 else "command"
+    title, unit = f"{name}: asked by the law, sent, in effect".capitalize(), " or ".join(takes.values())
     return tuple(
         replace(plot, title=title, unit=unit) if plot.key == "voltage_q" else plot
         for plot in PLOTS

@@ -10,12 +10,14 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from hil.report.collect import Run
-from hil.report.curves import CURVES, F4, F8, KEYS, Plot, plots_of
+from hil.report.collect import Run, one_log
+from hil.report.curves import CURVES, F4, F8, KEYS, Curve, Plot, plots_of
 from hil.report.statistics import SPECTRUM_FIELDS
 
 MOST_EVENTS: Final = 500
 GAP_PERIODS: Final = 3.5  # a longer silence breaks the line
+OF_REFERENCE: Final = ("w_ref", "error")
+"""Curves of a run that follows a speed reference."""
 FITTED: Final = ("voltage_q", "filled")  # the axis reaches to the limits
 
 
@@ -52,17 +54,38 @@ def run_data(run: Run) -> dict[str, Any]:
 
 def is_empty(runs: Sequence[Run], plot: Plot) -> bool:
     """True when no curve of a plot has a number in any run."""
-    rows = [KEYS.index(curve.key) for curve in plot.curves]
     if plot.key == "lateness" and not any(run.phases.lateness.max > 0 for run in runs):
         return True  # a lockstep run has no lateness
-    return not any(np.isfinite(run.envelope.bins()[1][rows]).any() for run in runs)
+    return not any(
+        np.isfinite(run.envelope.bins()[1][KEYS.index(curve.key)]).any()
+        for run in runs
+        for curve in shown(run, plot, several=False)
+    )
+
+
+def lines_of(runs: Sequence[Run], plot: Plot) -> list[tuple[float, str]]:
+    """The limits of a plot; of nodes that differ in them each by its name."""
+    every = [run.lines().get(plot.key, []) for run in runs]
+    if not one_log(runs) or all(lines == every[0] for lines in every):
+        return every[0]
+    return [
+        (value, f"{run.node} {name}" if name else "")
+        for run, lines in zip(runs, every, strict=True)
+        for value, name in lines
+    ]
+
+
+def shown(run: Run, plot: Plot, several: bool) -> list[Curve]:
+    """The curves of a run in a plot, beside those of others or alone."""
+    own = [curve for curve in plot.curves if curve.compared or not several]
+    return [curve for curve in own if run.follows or curve.key not in OF_REFERENCE]
 
 
 def plot_data(runs: Sequence[Run], plot: Plot) -> dict[str, Any]:
     """A plot: of one run all its curves, of several runs those that are compared, a colour for each run."""
     several, curves = len(runs) > 1, []
     for index, run in enumerate(runs):
-        chosen = [curve for curve in plot.curves if curve.compared or not several]
+        chosen = shown(run, plot, several)
         for place, curve in enumerate(chosen):
             label = f"{run.name}: {curve.label}" if several else curve.label
             colour, dash = (index, len(chosen) - 1 - place) if several else (place, 0)
@@ -74,7 +97,7 @@ def plot_data(runs: Sequence[Run], plot: Plot) -> dict[str, Any]:
         "curves": curves,
         "held": plot.held,
         "names": list(plot.names),
-        "lines": runs[0].lines().get(plot.key, []),
+        "lines": lines_of(runs, plot),
         "fit": plot.key in FITTED,
     }
 
@@ -94,6 +117,8 @@ def _lateness(runs: Sequence[Run]) -> dict[str, Any]:
 def _spectrum(runs: Sequence[Run], row: int) -> dict[str, Any]:
     curves = []
     for index, run in enumerate(runs):
+        if not (run.follows or row):
+            continue  # row 0 is the speed error
         frequencies, density = run.spectrum.density(run.rate_hz)
         xs, ys = (frequencies, density[row]) if run.spectrum.windows else (frequencies[:0], frequencies[:0])
         curves.append(
@@ -116,14 +141,18 @@ def charts(runs: Sequence[Run]) -> list[dict[str, Any]]:
     out = [
         _spectrum(runs, row) for row in range(len(SPECTRUM_FIELDS)) if any(r.spectrum.windows for r in runs)
     ]
-    return ([_lateness(runs)] if any(run.phases.lateness.max > 0 for run in runs) else []) + out
+    timed = runs[:1] if one_log(runs) else runs
+    return ([_lateness(timed)] if any(run.phases.lateness.max > 0 for run in runs) else []) + out
 
 
 def report_data(runs: Sequence[Run]) -> dict[str, Any]:
     """Everything that the script draws."""
+    drawn, plots = [run_data(run) for run in runs], plots_of(*(run.config for run in runs))
+    for again in drawn[1:] if one_log(runs) else ():
+        again["events"] = []  # they are the log's, and the first has them
     return {
-        "runs": [run_data(run) for run in runs],
-        "plots": [plot_data(runs, plot) for plot in plots_of(runs[0].config) if not is_empty(runs, plot)],
+        "runs": drawn,
+        "plots": [plot_data(runs, plot) for plot in plots if not is_empty(runs, plot)],
         "charts": charts(runs),
     }
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from typing import Any, Final
 
 from hil.config.filtered import known
-from hil.report.collect import Run
+from hil.report.collect import Run, one_log
 from hil.report.criteria import (
     FIGURES,
     SIGNS,
@@ -28,7 +28,7 @@ from hil.report.criteria import (
     verdict_text,
 )
 from hil.report.curves import limits_text, plots_of
-from hil.report.embed import MOST_EVENTS, charts, is_empty, report_data, script_json
+from hil.report.embed import MOST_EVENTS, charts, is_empty, lines_of, report_data, script_json
 from hil.report.frames import REMOTE, id_text
 from hil.report.section import Section
 from hil.report.segments import Response
@@ -133,15 +133,17 @@ def _usual(flag: str) -> bool:
 
 
 def metrics(runs: Sequence[Run]) -> str:
-    """Figures of all runs side by side, each with its difference from the first."""
+    """Figures of all runs side by side, each with its difference from the first (of the same node)."""
     values = [figures(run) for run in runs]
     head = ["", *(_swatch(i, len(runs) > 1) + escape(run.name) for i, run in enumerate(runs))]
-    head += [f"{escape(run.name)} − {escape(runs[0].name)}" for run in runs[1:]]
+    bases = {run.node: index for index, run in reversed(list(enumerate(runs)))}
+    pairs = [(bases[run.node], index) for index, run in enumerate(runs) if bases[run.node] != index]
+    head += [f"{escape(runs[index].name)} − {escape(runs[base].name)}" for base, index in pairs]
     rows = []
     for figure in FIGURES:
         own = [value[figure.key] for value in values]
         cells = [number(value, figure.unit) for value in own]
-        cells += [_difference(own[0], value, figure.unit) for value in own[1:]]
+        cells += [_difference(own[base], own[index], figure.unit) for base, index in pairs]
         rows.append((escape(figure.name), *map(escape, cells)))
     return table(head, rows)
 
@@ -159,6 +161,8 @@ def _go(t: float, span: float) -> str:
 
 def responses(run: Run) -> str:
     """The step responses of a run, each a link to its place."""
+    if not run.follows:
+        return '<p class="soft">Its torque is commanded: no speed is asked of it.</p>'
     head = ("t [s]", "step", "dip [rad/s]", "recovery [ms]", "rise [ms]", "overshoot [%]", "settling [ms]",
             "IAE [rad]", "ripple [rad/s]", "ripple i_q [A]", "estimate off [N m]")  # fmt: skip
     shown = run.responses.kept[:MOST_RESPONSES]
@@ -184,11 +188,25 @@ def phases(run: Run) -> str:
     return table(("phase [µs]", "mean", "p50", "p99", "p99.9", "max"), rows)
 
 
-def traffic(run: Run) -> str:
-    """Frames a direction and identifier, and the bus load."""
+def _frames(runs: Sequence[Run]) -> str:
+    """What was on each run's bus; that of several nodes is one, with the names of all their messages."""
+    if not one_log(runs):
+        return _each(runs, traffic)
+    every = [run.message_names() for run in runs]
+    names: dict[int, str] = {}
+    for run, own in zip(runs, every, strict=True):
+        names |= {
+            n: name if all(n in one for one in every) else f"{run.node} {name}" for n, name in own.items()
+        }
+    return traffic(runs[0], names)
+
+
+def traffic(run: Run, names: Mapping[int, str] | None = None) -> str:
+    """Frames a direction and identifier, and the bus load; ``names``: of messages, else as its DBC says."""
+    names = run.message_names() if names is None else names
     if not run.frames.traffic:
         return '<p class="soft">The log holds no frames.</p>'
-    names, load = run.message_names(), run.bus_load()
+    load = run.bus_load()
     rows = []
     for (can_id, received), t in sorted(run.frames.traffic.items()):
         length = f"{t.bytes_low}" if t.bytes_low == t.bytes_high else f"{t.bytes_low} to {t.bytes_high}"
@@ -238,18 +256,17 @@ def origin(run: Run) -> str:
     texts = "".join(
         f"<details><summary>{escape(name)}</summary><pre>{escape(text[:100_000])}</pre></details>"
         for name, text in run.log.attachments.items()
-        if name != "controller.json"
+        if name != "controller.json" and not any(name.endswith(f" of {node}") for node in run.log.nodes)
     )
     return table(("", ""), rows, False) + texts
 
 
 def _plots(runs: Sequence[Run]) -> str:
-    limits = runs[0].lines()
     return "".join(
         f'<div class="plot" id="plot-{plot.key}"><h3>{escape(plot.title)}'
         f"{f' [{escape(plot.unit)}]' if plot.unit else ''}"
-        f'<span class="soft small">{escape(limits_text(limits.get(plot.key, [])))}</span></h3></div>'
-        for plot in plots_of(runs[0].config)
+        f'<span class="soft small">{escape(limits_text(lines_of(runs, plot)))}</span></h3></div>'
+        for plot in plots_of(*(run.config for run in runs))
         if not is_empty(runs, plot)
     )
 
@@ -279,8 +296,9 @@ def page(runs: Sequence[Run], more: Sequence[Section] = ()) -> str:
         f"style-src {' '.join(map(_hash, styles))}; base-uri 'none'; form-action 'none'"
     )
     sections = "".join(f"<section><h2>{escape(s.title)}</h2>{s.html}</section>\n" for s in more)
-    title = escape(" · ".join(run.name for run in runs))
-    kind = "Comparison of runs" if len(runs) > 1 else "Run"
+    nodes, names = one_log(runs), " · ".join(run.name for run in runs)
+    title = escape(f"{runs[0].log.path.stem}: {names}" if nodes else names)
+    kind = f"Run of {len(runs)} nodes" if nodes else "Comparison of runs" if len(runs) > 1 else "Run"
     head = f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -295,10 +313,10 @@ double-click for the whole run; click a name under a plot to hide its curve</spa
 <section><h2>Curves</h2><div id="plots">{_plots(runs)}</div></section>
 {sections}<section><h2>Figures</h2>{metrics(runs)}</section>
 <section><h2>Step responses</h2>{_each(runs, responses)}</section>
-<section><h2>Time of a tick, spectra</h2>{_each(runs, phases)}
+<section><h2>Time of a tick, spectra</h2>{_each(runs[:1] if nodes else runs, phases)}
 <div class="columns">{_charts(runs)}</div></section>
-<section><h2>Frames on the bus</h2>{_each(runs, traffic)}</section>
-<section><h2>Events</h2>{_each(runs, events)}</section>
+<section><h2>Frames on the bus</h2>{_frames(runs)}</section>
+<section><h2>Events</h2>{_each(runs[:1] if nodes else runs, events)}</section>
 <section><h2>Replay</h2>{_each(runs, lambda run: f"<p>{escape(verdict_text(run))}</p>")}</section>
 <section><h2>Origin</h2>{_each(runs, origin)}</section>
 <script type="application/json" id="report">{script_json(report_data(runs))}</script>"""

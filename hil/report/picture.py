@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from hil.report.collect import Run
 from hil.report.criteria import judge
 from hil.report.curves import KEYS, Plot, limits_text, plots_of
-from hil.report.embed import FITTED, MOST_EVENTS, is_empty
+from hil.report.embed import FITTED, MOST_EVENTS, is_empty, lines_of, shown
 
 COLOURS: Final = ("#0b62c4", "#d1570a", "#15803d", "#9333ea", "#b4235a", "#0e7c86", "#7a5c00", "#50555b")
 INCHES: Final = (12.0, 2.0)
@@ -30,7 +30,7 @@ def picture(runs: Sequence[Run]) -> bytes:
 
 def figure(runs: Sequence[Run]) -> Figure:
     """The picture itself; two columns of plots."""
-    plots = [plot for plot in plots_of(runs[0].config) if not is_empty(runs, plot)]
+    plots = [plot for plot in plots_of(*(run.config for run in runs)) if not is_empty(runs, plot)]
     rows = max(1, -(-len(plots) // 2))
     with matplotlib.rc_context({"font.size": 8, "axes.grid": True, "grid.color": "#d8dde3"}):
         drawn = Figure(figsize=(INCHES[0], INCHES[1] * rows + 0.6), dpi=DPI, layout="constrained")
@@ -58,15 +58,16 @@ def _draw(axis: Any, plot: Plot, runs: Sequence[Run]) -> None:
     several = len(runs) > 1
     for index, run in enumerate(runs):
         t, low, high = run.curves()
-        chosen = [curve for curve in plot.curves if curve.compared or not several]
+        chosen = shown(run, plot, several)
         for place, curve in enumerate(chosen):
             colour = COLOURS[(index if several else place) % len(COLOURS)]
             row = KEYS.index(curve.key)
             label = f"{run.name}: {curve.label}" if several else curve.label
             _envelope(axis, plot, t, low[row], high[row], colour, label[:40])
-    for value, _ in runs[0].lines().get(plot.key, []) if plot.key in FITTED else ():
+    lines = lines_of(runs, plot)
+    for value, _ in lines if plot.key in FITTED else ():
         axis.axhline(value, color="#c4231c", linestyle="--", linewidth=0.7)
-    limits = limits_text(runs[0].lines().get(plot.key, []))
+    limits = limits_text(lines)
     title = f"{plot.title} [{plot.unit}]" if plot.unit else plot.title
     axis.set_title(f"{title}   {limits}".rstrip(), loc="left", fontsize=8)
     if plot.names:

@@ -189,8 +189,9 @@ def _run_armed(
 ) -> RunResult:
     outcome, failure, processor_ns = Outcome(), "", 0
     grants: list[realtime.Grant] = []
+    names = tuple(axis.name for axis in axes)
     try:
-        with driving(first.config, recorder, clock, request, takes) as grants:
+        with driving(first.config, recorder, clock, request, takes, names) as grants:
             begin_ns = time.thread_time_ns()
             outcome = loop.run()
             processor_ns = time.thread_time_ns() - begin_ns

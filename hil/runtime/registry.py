@@ -14,7 +14,7 @@ import signal
 import stat
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ class Entry:
     clock: str = "monotonic"
     takes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     """What ``hil set`` may ask, by name: least, most, rate [SI]."""
+    nodes: tuple[str, ...] = ()
+    """Of a run with several nodes their names, in the configuration's order."""
 
     def __str__(self) -> str:
         return f"PID {self.pid} on {self.bus}, log {self.log}"
@@ -117,10 +119,11 @@ def own_entry(
     ticks: int | None,
     clock: str = RealClock.name,
     takes: dict[str, tuple[float, float, float]] | None = None,
+    nodes: tuple[str, ...] = (),
 ) -> Entry:
     """The entry of this process; ``clock``: the name of its loop's."""
     start = start_time(os.getpid()) or 0
-    return Entry(os.getpid(), start, str(log), bus, rate_hz, ticks, clock, takes or {})
+    return Entry(os.getpid(), start, str(log), bus, rate_hz, ticks, clock, takes or {}, nodes)
 
 
 @contextlib.contextmanager
@@ -161,7 +164,8 @@ def _listed(entry: Entry) -> Path | None:
 
 def _read(path: Path) -> Entry | None:
     try:
-        return Entry(**json.loads(path.read_text(encoding="utf-8")))
+        entry = Entry(**json.loads(path.read_text(encoding="utf-8")))
+        return replace(entry, nodes=tuple(entry.nodes))
     except (OSError, ValueError, TypeError):
         return None
 

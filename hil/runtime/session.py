@@ -300,6 +300,7 @@ def driving(
     clock: RealClock | LockstepClock,
     request: StopRequest,
     takes: dict[str, tuple[float, float, float]],
+    nodes: tuple[str, ...] = (),
 ) -> Iterator[list[realtime.Grant]]:
     """While the loop runs: signals stop it, the rights asked for are granted, others see it."""
     ticks, where = plan_of(config).ticks, f"{config.bus.interface}:{config.bus.channel}"
@@ -309,7 +310,7 @@ def driving(
         if clock.name == "monotonic":
             realtime.keep_off(recorder.writer_pid, config.realtime.cpu)
             grants = realtime.acquire(config.realtime)
-        entry = own_entry(recorder.path, where, config.loop.rate_hz, ticks, clock.name, takes)
+        entry = own_entry(recorder.path, where, config.loop.rate_hz, ticks, clock.name, takes, nodes)
         with announced(entry), watching(os.getpid(), ticks):
             yield grants
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from hil.runtime.registry import WatchError, matching
 from hil.signals import FIELDS, Field, TickArray
-from hil.watch.look import Look, figures, outcome
+from hil.watch.look import Look, figures, no_node, outcome
 
 BINS_PER_S: Final = 100
 CURVES: Final = tuple(field for field in FIELDS if field.shown.live)
@@ -66,8 +66,8 @@ def live_plots(fields: Sequence[Field] = CURVES) -> list[tuple[str, list[tuple[s
 class Feed:
     """Follows one run after the other; :meth:`next` gives the messages that are new."""
 
-    def __init__(self, wanted: str | None) -> None:
-        self._wanted = wanted
+    def __init__(self, wanted: str | None, node: str = "") -> None:
+        self._wanted, self._node = wanted, node
         self._look: Look | None = None
         self._said = ""
         self.opening: list[str] = []
@@ -101,12 +101,15 @@ class Feed:
                 "waiting for a run" if not found else f"{len(found)} runs: name one, by PID, channel or log"
             )
             return self._status(wait) if not self._said.startswith("ended") or found else []
+        if why := no_node(found[0], self._node):
+            return self._status(why)
         try:
-            self._look = Look(found[0])
+            self._look = Look(found[0], self._node)
         except WatchError:
             return []  # it ended between the two
         entry = found[0]
         run = {"pid": entry.pid, "bus": entry.bus, "log": entry.log, "rate_hz": entry.rate_hz}
+        run |= {"node": self._look.node} if entry.nodes else {}
         self._said = ""
         self.opening = [
             json.dumps({"run": run | {"ticks": entry.ticks, "takes": entry.takes, "plots": live_plots()}})

@@ -35,13 +35,33 @@ def unpack_events(raw: bytes) -> list[Event]:
     return found
 
 
-class Look:
-    """A viewer's end of a run's rings, opened read-only. Raises WatchError when they can't be opened."""
+def no_node(entry: Entry, node: str) -> str:
+    """Why a run has no such node; empty where it has, and for none named."""
+    if not node or node in entry.nodes:
+        return ""
+    known = f"it has {' and '.join(entry.nodes)}" if entry.nodes else "it is of one drive: leave the node out"
+    return f"{entry} has no node {node!r:.40}; {known}"
 
-    def __init__(self, entry: Entry) -> None:
+
+def ring_of(entry: Entry, node: str) -> str:
+    """What the ring of a node's ticks is called."""
+    place = entry.nodes.index(node) if node else 0
+    return f"ticks-{place}" if place else "ticks"
+
+
+class Look:
+    """A viewer's end of a run's rings, opened read-only. Raises WatchError when they can't be opened.
+
+    ``node``: of a run with several nodes the one whose ticks are seen; empty: the first.
+    """
+
+    def __init__(self, entry: Entry, node: str = "") -> None:
         self.entry = entry
+        self.node = node or next(iter(entry.nodes), "")
+        if why := no_node(entry, node):
+            raise WatchError(why)
         try:
-            self._ticks = attach(entry.pid, "ticks")
+            self._ticks = attach(entry.pid, ring_of(entry, self.node))
             try:
                 self._events = attach(entry.pid, "events")
             except RingError:

@@ -8,13 +8,21 @@ so any program and any web page of this machine can read: ``hil watch`` asks for
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from hil.log.ring import RingError, attach
-from hil.log.schema import FRAME, FRAME_HEAD, TOPICS, file_descriptor_set, frame_messages, pack_event
+from hil.log.schema import (
+    FRAME,
+    FRAME_HEAD,
+    TOPICS,
+    file_descriptor_set,
+    frame_messages,
+    node_topic,
+    pack_event,
+)
 from hil.runtime.registry import WatchError, choose
 from hil.signals import TickArray
 from hil.watch.look import Look, outcome
@@ -35,12 +43,12 @@ def sdk() -> Any:
     return foxglove
 
 
-def channels(foxglove: Any, context: Any) -> dict[str, Any]:
-    """One channel a topic, with the schema that is embedded in the log files."""
+def channels(foxglove: Any, context: Any, nodes: Sequence[str] = ()) -> dict[str, Any]:
+    """One channel a topic, with the schema that is embedded in the log files; ``nodes``: after the first."""
     data = file_descriptor_set().SerializeToString()
     out = {}
-    for topic in SENT:
-        schema = foxglove.Schema(name=TOPICS[topic], encoding="protobuf", data=data)
+    for topic in (*SENT, *map(node_topic, nodes)):
+        schema = foxglove.Schema(name=TOPICS.get(topic, TOPICS["/tick"]), encoding="protobuf", data=data)
         out[topic] = foxglove.Channel(topic, schema=schema, message_encoding="protobuf", context=context)
     return out
 
@@ -55,10 +63,13 @@ class Stream:
         except RingError as error:
             raise WatchError(str(error)) from error
         self._frames_seen = self._frames.published
+        self._more = {node_topic(node): Look(look.entry, node) for node in look.entry.nodes[1:]}
 
     def once(self) -> None:
         """Pass on what is new."""
-        self._pass_ticks(self._look.new_ticks())
+        self._pass_ticks("/tick", self._look.new_ticks())
+        for topic, look in self._more.items():
+            self._pass_ticks(topic, look.new_ticks())
         for t_ns, k, kind, text in self._look.new_events():
             self._to["/event"].log(pack_event(t_ns, k, kind, text), log_time=t_ns)
         raw, self._frames_seen = self._frames.since(self._frames_seen)
@@ -68,19 +79,21 @@ class Stream:
             data = message.tobytes()[: FRAME_HEAD + int(frame["size"])]
             self._to[topic].log(data, log_time=int(frame["t_ns"]))
 
-    def _pass_ticks(self, ticks: TickArray) -> None:
+    def _pass_ticks(self, topic: str, ticks: TickArray) -> None:
         for tick in ticks:
-            self._to["/tick"].log(tick.tobytes(), log_time=int(tick["t_ns"]))
+            self._to[topic].log(tick.tobytes(), log_time=int(tick["t_ns"]))
 
     def close(self) -> None:
-        """Let go of the ring."""
+        """Let go of the rings."""
+        for look in self._more.values():
+            look.close()
         self._frames.close()
 
 
 async def _serve(look: Look, port: int, say: Callable[[str], None]) -> None:
     foxglove = sdk()
     context = foxglove.Context()
-    to = channels(foxglove, context)
+    to = channels(foxglove, context, look.entry.nodes[1:])
     try:
         server = foxglove.start_server(
             name="hil watch", host="127.0.0.1", port=port, context=context, message_backlog_size=BACKLOG

@@ -95,6 +95,12 @@ def _events(events: list[Event], entry: Entry) -> Text:
     return Text(plain("\n".join(lines)) or f"no events yet on {entry.bus}", overflow="ellipsis", no_wrap=True)
 
 
+def _node(look: Look) -> str:
+    """Which of several nodes is seen, and how another one is."""
+    others = ", ".join(f"--node {name}" for name in look.entry.nodes if name != look.node)
+    return f"  node {look.node} (another: {others})" if look.node else ""
+
+
 def frame(look: Look, width: int, note: str = "") -> RenderableType:
     """The whole view."""
     ticks = look.latest(round(SHOWN_S * look.entry.rate_hz))
@@ -109,7 +115,7 @@ def frame(look: Look, width: int, note: str = "") -> RenderableType:
     )
     return Panel(
         body,
-        title=Text(plain(f"hil run  PID {entry.pid}  {entry.bus}")),
+        title=Text(plain(f"hil run  PID {entry.pid}  {entry.bus}{_node(look)}")),
         subtitle=note or None,
         title_align="left",
     )

@@ -52,8 +52,8 @@ def asset(package: str, name: str) -> bytes:
 class Web:
     """The server's state: the feed, the token, who looks."""
 
-    def __init__(self, wanted: str | None, port: int) -> None:
-        self._feed = Feed(wanted)
+    def __init__(self, wanted: str | None, port: int, node: str = "") -> None:
+        self._feed = Feed(wanted, node)
         self._token = secrets.token_urlsafe(TOKEN_BYTES)
         self.port = port
         self._viewers: dict[ServerConnection, Viewer] = {}
@@ -197,13 +197,13 @@ async def start(web: Web) -> Server:
     return server
 
 
-async def _serve(wanted: str | None, port: int, say: Callable[[str], None]) -> None:
-    web = Web(wanted, port)
+async def _serve(wanted: str | None, port: int, say: Callable[[str], None], node: str) -> None:
+    web = Web(wanted, port, node)
     async with await start(web):
         say(f"hil: {web.address} (who has it can stop the run; Ctrl-C ends the page, not the run)")
         await web.feed()
 
 
-def run(wanted: str | None, port: int, say: Callable[[str], None]) -> None:
-    """Serve until interrupted."""
-    asyncio.run(_serve(wanted, port, say))
+def run(wanted: str | None, port: int, say: Callable[[str], None], node: str = "") -> None:
+    """Serve until interrupted; ``node``: as for :class:`hil.watch.look.Look`."""
+    asyncio.run(_serve(wanted, port, say, node))

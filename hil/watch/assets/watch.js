@@ -81,7 +81,8 @@
   function on(message) {
     if (message.run) {
       kept = {t: []}; asked = false;
-      get("run").textContent = `PID ${message.run.pid} on ${message.run.bus}, log ${message.run.log}`;
+      const node = message.run.node ? `node ${message.run.node}, ` : "";
+      get("run").textContent = `${node}PID ${message.run.pid} on ${message.run.bus}, log ${message.run.log}`;
       get("note").textContent = "";
       get("stop").disabled = false;
       takes(message.run.takes?.w);
