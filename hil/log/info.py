@@ -42,7 +42,7 @@ class Info:
         names = nodes_named(self.metadata)
         ends = result_of(self.metadata).get("nodes")
         own = ends if isinstance(ends, dict) else {}
-        topics = dict(zip(names, ("/tick", *map(node_topic, names[1:])), strict=True))
+        topics = {name: node_topic(name) if place else "/tick" for place, name in enumerate(names)}
         return {
             name: {"ticks": self.counts.get(topic, 0)} | dict(own.get(name, {}))
             for name, topic in topics.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import signal
 import subprocess
@@ -15,11 +16,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from hil.cli import main
 from hil.log.records import EVENT_BYTES, pack_event_record
 from hil.log.ring import Ring
 from hil.runtime import registry
 from hil.runtime.registry import WatchError, announced, ask_stop, choose, own_entry, runs, who_asked
 from hil.signals import TICK, new_ticks
+from hil.watch.feed import Feed
 from hil.watch.look import Look, figures, unpack_events
 from hil.watch.terminal import frame, sparkline
 
@@ -211,3 +214,42 @@ def test_a_spike_shows_in_a_sparkline_and_a_constant_is_flat() -> None:
     assert len(line) == 60 and line.count("█") == 1 and line.count("▁") == 59
     assert len(set(sparkline(np.full(100, 7.0), 20, 1.0))) == 1
     assert sparkline(np.full(5, np.nan), 20, 1.0) == ""
+
+
+def test_of_several_nodes_each_is_seen_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    rings = [Ring.create(name, TICK.itemsize, 100) for name in ("ticks", "ticks-1")]
+    rings.append(Ring.create("events", EVENT_BYTES, 8))
+    bench = replace(entry(), nodes=("motor", "load"))
+    for ring, w in zip(rings, (40.0, -7.0), strict=False):
+        ticks = new_ticks(1)
+        ticks["w"] = w
+        ring.push(ticks.tobytes())
+    seen = {}
+    with announced(bench):
+        assert runs() == [bench], "the names come back as they were"
+        for node in ("", "motor", "load"):
+            look = Look(choose(None), node)
+            seen[node, look.node] = float(look.latest(1)["w"][0])
+            look.close()
+        assert seen == {("", "motor"): 40.0, ("motor", "motor"): 40.0, ("load", "load"): -7.0}
+        with pytest.raises(WatchError, match="has no node 'other'; it has motor and load"):
+            Look(bench, "other")
+        with pytest.raises(WatchError, match="has no node 'load'; it is of one drive: leave the node out"):
+            Look(entry(), "load")
+        assert main(["watch", "--json", "--node", "load"]) == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["w"] == -7.0 and {name: one["w"] for name, one in told["nodes"].items()} == {
+            "motor": 40.0, "load": -7.0
+        }  # fmt: skip
+        assert main(["watch", "--once", "--node", "load"]) == 0
+        assert "node load (another: --node motor)" in capsys.readouterr().out
+        assert main(["watch", "--foxglove", "--open", "--node", "load"]) == 2
+        assert "has the ticks of all nodes; leave out --node load" in capsys.readouterr().err
+        (status,) = Feed(None, "other").next()
+        assert "has no node 'other'" in json.loads(status)["status"]
+        feed = Feed(None, "load")
+        assert json.loads(feed.next()[0])["run"]["node"] == "load"
+        assert feed.look is not None and feed.look.node == "load"
+        feed.look.close()
+    for ring in rings:
+        ring.close()
