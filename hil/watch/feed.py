@@ -112,7 +112,9 @@ class Feed:
         run |= {"node": self._look.node} if entry.nodes else {}
         self._said = ""
         self.opening = [
-            json.dumps({"run": run | {"ticks": entry.ticks, "takes": entry.takes, "plots": live_plots()}})
+            json.dumps(
+                {"run": run | {"ticks": entry.ticks, "takes": self._look.takes, "plots": live_plots()}}
+            )
         ]
         return list(self.opening)
 

@@ -121,9 +121,14 @@ class Look:
         t_ns, k = (int(newest[name][-1]) for name in ("t_ns", "k")) if len(newest) else (0, 0)
         return "stop asked" if ask_stop(self.entry, who, t_ns, k) else "asked already, or ended"
 
+    @property
+    def takes(self) -> dict[str, tuple[float, float, float]]:
+        """What may be set of what is seen: set-points are the first node's."""
+        return self.entry.takes if self.node in ("", *self.entry.nodes[:1]) else {}
+
     def set(self, values: dict[str, float], who: str) -> str:
         """Ask for other references; say in a few words what came of it."""
-        if why := outside(values, self.entry.takes):
+        if why := outside(values, self.takes):
             return f"refused: {why}"
         try:
             ask(self.entry.pid, values, who, timeout_s=0.5)

@@ -219,14 +219,14 @@ def test_a_spike_shows_in_a_sparkline_and_a_constant_is_flat() -> None:
 def test_of_several_nodes_each_is_seen_by_its_name(capsys: pytest.CaptureFixture[str]) -> None:
     rings = [Ring.create(name, TICK.itemsize, 100) for name in ("ticks", "ticks-1")]
     rings.append(Ring.create("events", EVENT_BYTES, 8))
-    bench = replace(entry(), nodes=("motor", "load"))
+    bench = replace(entry(), nodes=("motor", "load"), takes={"w": (-1.0, 1.0, 1.0)})
     for ring, w in zip(rings, (40.0, -7.0), strict=False):
         ticks = new_ticks(1)
         ticks["w"] = w
         ring.push(ticks.tobytes())
     seen = {}
     with announced(bench):
-        assert runs() == [bench], "the names come back as they were"
+        assert [run.nodes for run in runs()] == [("motor", "load")], "the names come back as they were"
         for node in ("", "motor", "load"):
             look = Look(choose(None), node)
             seen[node, look.node] = float(look.latest(1)["w"][0])
@@ -248,8 +248,10 @@ def test_of_several_nodes_each_is_seen_by_its_name(capsys: pytest.CaptureFixture
         (status,) = Feed(None, "other").next()
         assert "has no node 'other'" in json.loads(status)["status"]
         feed = Feed(None, "load")
-        assert json.loads(feed.next()[0])["run"]["node"] == "load"
+        opening = json.loads(feed.next()[0])["run"]
+        assert opening["node"] == "load" and opening["takes"] == {}, "w is the motor's"
         assert feed.look is not None and feed.look.node == "load"
+        assert feed.look.set({"w": 0.5}, "a test") == "refused: this run takes no set-point"
         feed.look.close()
     for ring in rings:
         ring.close()
