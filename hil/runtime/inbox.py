@@ -71,7 +71,9 @@ def _check(number: int, has: int, w: int, i_q: int) -> int:
 
 
 def ranges(machine: Machine, law: str) -> dict[str, tuple[float, float, float]]:
-    """What a law takes, by name: least, most, rate [SI]."""
+    """What a law takes, by name: least, most, rate [SI]; nothing for a commanded torque, which has no w*."""
+    if law == "torque":
+        return {}
     p = machine.setpoint[0]
     found = {"w": (float(p["w_min"]), float(p["w_max"]), float(p["w_rate"]))}
     if law == "fac":

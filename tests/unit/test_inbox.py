@@ -89,6 +89,7 @@ def test_a_run_that_does_not_answer_is_said() -> None:
 def test_each_law_takes_what_it_has_a_reference_for() -> None:
     cascade = set_by_others(load_setup(CONFIGS / "demo.toml", Overrides()))
     fac = set_by_others(load_setup(CONFIGS / "paper.toml", Overrides()))
+    assert set_by_others(load_setup(CONFIGS / "dyno.toml", Overrides(settings=('node="load"',)))) == {}
     assert set(cascade) == {"w"} and set(fac) == {"w", "i_q"}
     assert cascade["w"] == pytest.approx((-135.0, 135.0, 150.0)) and fac["i_q"][:2] == (-13.5, 13.5)
     assert outside({"i_q": 1.0}, cascade) == "this run's law takes w, not i_q"
