@@ -208,6 +208,7 @@ LAW_STATE: Final = np.dtype(
         ("capped", "i8"),
         ("theta", "f8"),
         ("v_dc", "f8"),
+        ("asked", "f8"),
     ],
     align=True,
 )
@@ -217,7 +218,7 @@ of a drive's own current loop what flows, and the commands on their way, newest 
 rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
 whether what was asked for was capped; the measured angle of the shaft, where a load over it is known, and the
-measured DC link, where it limits."""
+measured DC link, where it limits; the torque of a table over k_t [A]."""
 
 Record = npt.NDArray[np.void]
 
@@ -700,11 +701,17 @@ def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> Non
     """The cascade, whose torque is made by the least current that the voltage allows; i_d follows i_d*.
 
     tau = psi_f i_q + (L_d - L_q) i_d i_q: the speed law's q current, and what c(x_p) has already put in for
-    the reluctance torque.
+    the reluctance torque. With rows the torque is that of a table (the law ``torque``), no speed's.
     """
     psi_f, w = p["k_t"] / (1.5 * p["n_p"]), p["n_p"] * s["x_p"][0]
-    reluctance = (p["L_d"] - p["L_q"]) * s["x_p"][2] * s["x_p"][1]
-    tau = psi_f * asked_current(p, s, w_ref, dw_ref) + reluctance
+    if p["rows"] > 0:
+        if w_ref != p["w_run"]:
+            s["row"] = p["rows"]
+        s["asked"] = torque_step(p, s, s["asked"])
+        tau = psi_f * s["asked"]
+    else:
+        reluctance = (p["L_d"] - p["L_q"]) * s["x_p"][2] * s["x_p"][1]
+        tau = psi_f * asked_current(p, s, w_ref, dw_ref) + reluctance
     i_d_ref, i_q_ref, capped = operating_point(p, tau, w, steady_room(p, s, w, u_limit))
     s["capped"] = int(capped)
     s["i_d_ref"], s["i_q_ref"] = i_d_ref, braked(p, s, w, i_d_ref, i_q_ref) if p["regen"] else i_q_ref
@@ -768,7 +775,7 @@ def identify_law(p: Any, s: Any, w_ref: float) -> None:
         return
     if over:
         s["row"] = p["rows"]
-    s["i_q_ref"] = fed_back(p, s, torque_step(p, s))
+    s["i_q_ref"] = fed_back(p, s, torque_step(p, s, s["i_q_ref"]))
     current_law(p, s)
 
 
@@ -777,7 +784,7 @@ def identify_speed(p: Any, s: Any, w_ref: float) -> None:
     """:func:`identify_law` for a drive with a current loop of its own: the row's current is the command."""
     if w_ref != p["w_run"] or abs(s["x"][0]) > p["goal"][0]:
         s["row"] = p["rows"]
-    s["i_q_ref"] = fed_back(p, s, torque_step(p, s))
+    s["i_q_ref"] = fed_back(p, s, torque_step(p, s, s["i_q_ref"]))
     s["u"][0], s["u"][1], s["u"][2] = 0.0, s["i_q_ref"] * p["u_i"], 0.0
 
 
@@ -788,7 +795,7 @@ def fed_back(p: Any, s: Any, i_q: float) -> float:
 
 
 @jit
-def torque_step(p: Any, s: Any) -> float:
+def torque_step(p: Any, s: Any, before: float) -> float:
     """i_q* of the row, reached at its slew [A/tick]; the row ends at its speed, or after its ticks.
 
     A shaft that turns against the first row's torque by ``w_wrong`` gets no torque any more.
@@ -807,7 +814,7 @@ def torque_step(p: Any, s: Any) -> float:
     if s["row"] >= p["rows"]:  # to rest: full torque down to a tenth of the speed, then in proportion
         return float(-p["i_brake"] * min(max(10.0 * w / p["goal"][0], -1.0), 1.0))
     most = p["row_slew"][s["row"]]
-    return float(min(max(p["row_q"][s["row"]], s["i_q_ref"] - most), s["i_q_ref"] + most))
+    return float(min(max(p["row_q"][s["row"]], before - most), before + most))
 
 
 @jit

@@ -29,6 +29,8 @@ def speed_drive(path: Path, overrides: Overrides) -> Setup:
     kind = int(setup.machine.law["kind"][0])
     if kind == FAC:
         raise HilError(f"{path}: controller.kind fac commands the load; only speed drives can be tuned")
+    if setup.config.controller.kind == "torque":
+        raise HilError(f"{path}: controller.kind torque follows no speed; only speed drives can be tuned")
     if kind not in (CASCADE, PI):
         if kind == MTPA:
             raise HilError(
