@@ -12,9 +12,9 @@ import numpy as np
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import SHORTEST, Samples, joined, samples_of, turning
-from hil.identify.fit import Fit, Shaft, fit, frozen
+from hil.identify.fit import Fit, Shaft, bending, fit, frozen
 from hil.identify.inner import InnerFit, evenly
-from hil.identify.model import B_F, COULOMB, L_D, L_Q, LOAD, PSI_F, R_S, Flags, J
+from hil.identify.model import B_F, COULOMB, L_D, L_Q, LOAD, PSI_F, R_S, SATURATION, Flags, J, unsaturated
 from hil.identify.shaft import calm, rough, times
 from hil.signals import TickArray
 
@@ -33,11 +33,15 @@ BROKEN: Final = 4.0
 UNITS: Final = {
     "R_s": "ohm", "L_d": "H", "L_q": "H", "psi_f": "Wb", "k_t": "N m/A", "J": "kg m2", "B_f": "N m s",
     "coulomb": "N m", "load": "N m", "delay": "ticks", "lag": "s", "k_t_over_J": "rad/s2/A",
-    "w_noise": "rad/s", "i_q_noise": "A", "i_d_noise": "A",
+    "w_noise": "rad/s", "i_q_noise": "A", "i_d_noise": "A", "L_q_saturation": "A",
+    "w_lsb": "rad/s", "i_q_lsb": "A", "i_d_lsb": "A", "arrival": "s", "arrival_jitter": "s",
+    "echo_lag": "ticks",
 }  # fmt: skip
 PLACES: Final = {
     "R_s": R_S, "L_d": L_D, "L_q": L_Q, "psi_f": PSI_F, "J": J, "B_f": B_F, "coulomb": COULOMB, "load": LOAD,
 }  # fmt: skip
+LEVELS: Final = (0.0, 0.5, 1.0)
+"""Shares of the largest q current at which a saturating L_q is told."""
 EXCITES: Final = {
     "R_s": "a current that stands for a few L/R",
     "L_d": "steps of u_d (step standstill)",
@@ -81,13 +85,15 @@ def known_k_t(value: float) -> Parameter:
 class Estimate:
     """Parameters by name; ``findings``: what is odd; ``faults``: what a person must look at first.
 
-    ``white``: p-values of the residuals' whiteness by output. ``samples`` and ``fit`` are for a report.
+    ``white``: p-values of the residuals' whiteness by output. ``saturation``: L_q = psi_q / i_q at some
+    currents, where it saturates. ``samples`` and ``fit`` are for a report.
     """
 
     parameters: dict[str, Parameter] = field(default_factory=dict)
     findings: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     white: dict[str, float] = field(default_factory=dict)
+    saturation: list[dict[str, Any]] = field(default_factory=list)
     samples: Samples | None = None
     fit: Fit | InnerFit | None = None
 
@@ -103,6 +109,7 @@ class Estimate:
             "findings": self.findings,
             "faults": self.faults,
             "white": self.white,
+            "saturation": self.saturation,
         }
 
     def put(self, name: str, value: float, half: float, why: str = "") -> None:
@@ -125,6 +132,7 @@ def estimate(runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> Estima
     samples, shaft = _without_disturbed(out, samples, guess)
     found = _fitted(out, samples, guess, shaft)
     _note_parameters(out, found, guess)
+    note_saturation(out, found)
     _note_noise(out, everything)
     _note_delay(out, runs, T_s, guess)
     _note_pole_pairs(out, guess)
@@ -171,7 +179,7 @@ def _without_disturbed(out: Estimate, samples: Samples, guess: MotorModel) -> tu
 
 def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) -> Fit:
     """The fit, again without what it shows to be disturbed."""
-    found = fit(samples, guess, shaft)
+    found = bent(samples, guess, fit(samples, guess, shaft))
     for _ in range(3):
         size = np.bincount(samples.segment)
         spread = np.sqrt(np.bincount(samples.segment, found.residual[:, 0] ** 2) / size)
@@ -183,10 +191,26 @@ def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) ->
         for begin, end in times(samples, bad):
             out.findings.append(f"left out: the load changed between {begin:.2f} and {end:.2f} s")
         samples = samples.segments(~bad)
-        found = fit(samples, _as_motor(found, guess), Shaft(found.value[COULOMB], found.value[LOAD]))
+        found = fit(samples, _as_motor(found, guess), _as_shaft(found))
+        found = found if found.saturation else bent(samples, guess, found)
     out.samples, out.fit = samples, found
     out.white = dict(zip(("w", "i_q", "i_d"), (float(p) for p in found.white), strict=True))
     return found
+
+
+def bent(samples: Samples, guess: MotorModel, found: Fit) -> Fit:
+    """The fit, again with a saturating L_q where its residuals ask for that and the data then tell it."""
+    motor, shaft = _as_motor(found, guess), _as_shaft(found)
+    saturation = bending(samples, motor, shaft, found.sigma)
+    if saturation == 0.0:
+        return found
+    again = fit(samples, motor, replace(shaft, saturation=saturation))
+    return again if again.half[SATURATION] < again.value[SATURATION] else found
+
+
+def _as_shaft(found: Fit) -> Shaft:
+    """Friction, load and saturation of the fit."""
+    return Shaft(float(found.value[COULOMB]), float(found.value[LOAD]), found.saturation)
 
 
 def _as_motor(found: Fit, guess: MotorModel) -> MotorModel:
@@ -220,6 +244,36 @@ def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
     load = out.parameters["load"]
     if load.told and abs(load.value) > load.half + 0.05 * abs(out.parameters["coulomb"].value):
         out.findings.append(f"a load of {load.value:.3g} N m acts on the shaft all the time")
+
+
+def note_saturation(out: Estimate, found: Fit) -> None:
+    """Where L_q saturates: the current at which it has halved, and psi_q / i_q up to the largest current."""
+    s = found.saturation
+    if s == 0.0 or out.samples is None:
+        return
+    peak = float(np.abs(out.samples.y[:, 1]).max())
+    half = 2.0 / math.sqrt(s)
+    out.put("L_q_saturation", half, 0.5 * half * float(found.half[SATURATION]) / s)
+    for share in LEVELS:
+        value, error = chord(found, share * peak)
+        row = Parameter(value, value - error, value + error, UNITS["L_q"])
+        out.saturation.append({"i_q_a": share * peak, **row.as_dict()})
+    words = ", ".join(f"{row['value']:.4g} H at {row['i_q_a']:.3g} A" for row in out.saturation)
+    out.findings.append(f"L_q saturates: {words}; told with currents up to {peak:.3g} A")
+
+
+def chord(found: Fit, current: float) -> tuple[float, float]:
+    """psi_q / i_q at a current [A] by a fit with saturation, and its half-width, both [H]."""
+
+    def logarithm(s: float) -> float:
+        return math.log1p(s * unsaturated(current, s) ** 2)
+
+    s = found.saturation
+    slope = (logarithm(s * 1.001) - logarithm(s * 0.999)) / math.log(1.001 / 0.999)
+    g = np.zeros(len(found.value))
+    g[L_Q], g[SATURATION] = 1.0, -slope
+    value = float(found.value[L_Q]) * math.exp(-logarithm(s))
+    return value, value * math.hypot(math.sqrt(float(g @ found.cov @ g)), EXACT)
 
 
 def _why(name: str) -> str:
@@ -257,18 +311,51 @@ def _at_rest(out: Estimate, samples: Samples) -> None:
 def _note_delay(out: Estimate, runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> None:
     """Ticks from sending a voltage to its effect: the shift under which the currents fit best."""
     assert isinstance(out.fit, Fit)  # noqa: S101 - called after it
+    cost = _by_delay(runs, T_s, out.fit, guess)
+    best, echoed = (
+        int(np.argmin(cost)),
+        int(np.argmin([_echo_off(runs, d) for d in range(2 * MOST_DELAY + 1)])),
+    )
+    if echoed != best:  # the fit rests on what was echoed: again, on what was sent
+        _refitted(out, runs, T_s, guess, best)
+        cost = _by_delay(runs, T_s, out.fit, guess)
+        best = int(np.argmin(cost))
     motor = _as_motor(out.fit, guess)
-    cost = [_shifted(runs, T_s, out.fit, motor, d) for d in range(MOST_DELAY + 1)]
-    best = int(np.argmin(cost))
     others = min(value for d, value in enumerate(cost) if d != best)
     why = "" if others > 1.1 * cost[best] else "the voltage hardly changes: the delay can't be told"
     out.put("delay", float(best), 0.0, why)
     own = _shifted(runs, T_s, out.fit, motor, None)
+    out.put("echo_lag", float(echoed - best), 0.0, why)
     if not why and cost[best] < 0.7 * own:
         out.findings.append(
             f"the echo of the commands lags: with a delay of {best} ticks the currents fit "
             f"{own / cost[best]:.1f} times better"
         )
+
+
+def _by_delay(runs: Sequence[TickArray], T_s: float, found: Fit, guess: MotorModel) -> list[float]:
+    """What is left of the currents by how many ticks before the voltage was sent."""
+    motor = _as_motor(found, guess)
+    return [_shifted(runs, T_s, found, motor, d) for d in range(MOST_DELAY + 1)]
+
+
+def _refitted(out: Estimate, runs: Sequence[TickArray], T_s: float, guess: MotorModel, delay: int) -> None:
+    """The estimate from the voltages as sent so many ticks before, instead of the echoed ones."""
+    assert isinstance(out.fit, Fit)  # noqa: S101 - called after it
+    parts = [part for part in (samples_of(run, T_s, delay) for run in runs) if len(part) >= SHORTEST]
+    everything = joined(parts)
+    out.samples = thinned(excited(everything.with_free(turning(everything))))
+    out.fit = fit(out.samples, _as_motor(out.fit, guess), _as_shaft(out.fit))
+    out.findings = [line for line in out.findings if "can't be told apart" not in line]
+    _note_parameters(out, out.fit, guess)
+
+
+def _echo_off(runs: Sequence[TickArray], delay: int) -> float:
+    """How far what the echo says was applied is off what was sent so many ticks before [V], on average."""
+    off = [
+        np.abs(run[f"ua_{n}"] - np.roll(run[f"u_{n}"], delay + 1))[delay + 1 :] for run in runs for n in "qd"
+    ]
+    return float(np.nanmean(np.concatenate(off)))
 
 
 def _shifted(
@@ -281,7 +368,7 @@ def _shifted(
     samples = excited(joined(parts).tidy())
     if len(samples) == 0:
         return math.inf
-    residual = frozen(thinned(samples), motor, found.sigma)
+    residual = frozen(thinned(samples), motor, found.sigma, found.saturation)
     return float(np.sqrt(np.mean(residual[:, 1:] ** 2)))
 
 
@@ -297,7 +384,7 @@ def _note_pole_pairs(out: Estimate, guess: MotorModel) -> None:
     costs = {}
     for n in range(1, 2 * guess.n_p + 5):
         motor = replace(own, n_p=n, psi_f=own.psi_f * guess.n_p / n)
-        costs[n] = float(np.mean(frozen(fast, motor, found.sigma)[:, 2] ** 2))
+        costs[n] = float(np.mean(frozen(fast, motor, found.sigma, found.saturation)[:, 2] ** 2))
     best = min(costs, key=lambda n: costs[n])
     if costs[best] < 0.9 * costs[guess.n_p] and costs[guess.n_p] - costs[best] > PLAIN:
         out.faults.append(f"the cross-coupling of the currents is that of {best} pole pairs, not {guess.n_p}")

@@ -19,30 +19,39 @@ from scipy.stats import t as student
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import Samples
-from hil.identify.model import B_F, COULOMB, LOAD, PSI_F, outputs, responses
+from hil.identify.model import B_F, COULOMB, LOAD, N_P, PSI_F, SATURATION, outputs, responses
 
 WIDE: Final = 3.0
 """Deviation of ln(parameter) before the data: a factor of 20; keeps what they do not tell finite."""
 LEVEL: Final = 0.95
 COUNT: Final = LOAD + 1
-LOGS: Final = np.array([True, True, True, False, True, False, False, False])
+LOGS: Final = np.array([True, True, True, False, True, False, False, False, True])
 """Which parameters are searched for by their logarithms."""
+SURE: Final = 6.0
+"""Deviations by which L_q must seem to saturate before that is a parameter."""
+BENDS: Final = 0.02
+"""Share by which it must seem to fall up to the largest current for that."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shaft:
-    """What starts the search besides the motor: Coulomb friction and constant load [N m]."""
+    """What starts the search besides the motor: Coulomb friction and constant load [N m].
+
+    ``saturation`` [1/A2]: that of L_q (:mod:`hil.identify.model`); 0: there is none.
+    """
 
     coulomb: float = 0.0
     load: float = 0.0
+    saturation: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
     """Parameters in the model's order (8,), their 95 % half-widths; residuals (N, 3), deviations (3,).
 
-    ``told``: share of what was open before that the data closed; 0 nothing, 1 all. ``white``: p-values of the
-    three residuals' whiteness.
+    With saturation 9. ``told``: share of what was open before that the data closed; 0 nothing, 1 all.
+    ``white``: p-values of the three residuals' whiteness. ``cov``: of the search's numbers, times the squared
+    quantile that makes half-widths of its roots.
     """
 
     value: Array
@@ -52,11 +61,20 @@ class Fit:
     sigma: Array
     output: Array
     white: Array
+    cov: Array
+
+    @property
+    def saturation(self) -> float:
+        """That of L_q [1/A2]; 0: none."""
+        return float(self.value[SATURATION]) if len(self.value) > COUNT else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Samples, pole pairs and scales: from the search's numbers x (8,) to outputs and weighted residuals."""
+    """Samples, pole pairs and scales: from the search's numbers x to outputs and weighted residuals.
+
+    x (8,), or with the saturation of L_q (9,).
+    """
 
     samples: Samples
     n_p: float
@@ -66,7 +84,10 @@ class Problem:
 
     def motor(self, x: Array) -> Array:
         """The model's vector."""
-        return np.append(np.where(LOGS, np.exp(np.where(LOGS, x, 0.0)), x * self.unit), self.n_p)
+        logs, p = LOGS[: len(x)], np.zeros(N_P + 1)
+        p[: len(x)] = np.where(logs, np.exp(np.where(logs, x, 0.0)), x * self.unit)
+        p[N_P] = self.n_p
+        return p
 
     def output(self, x: Array, weight: Array) -> Array:
         """w, i_q, i_d (N, 3) from the best starts."""
@@ -82,10 +103,10 @@ class Problem:
         return np.nan_to_num(found, nan=1e6, posinf=1e6, neginf=-1e6)
 
     def jacobian(self, x: Array, weight: Array) -> Array:
-        """(N, 3, 8), starts eliminated, by differences."""
-        here, out = self.residual(x, weight), np.empty((len(self.samples), 3, COUNT))
-        for j in range(COUNT):
-            step = np.zeros(COUNT)
+        """(N, 3, len(x)), starts eliminated, by differences."""
+        here, out = self.residual(x, weight), np.empty((len(self.samples), 3, len(x)))
+        for j in range(len(x)):
+            step = np.zeros(len(x))
             step[j] = 1e-6 * min(self.wide[j], 1.0)
             out[:, :, j] = (self.residual(x + step, weight) - here) / step[j]
         return out
@@ -94,7 +115,7 @@ class Problem:
     def used(self) -> int:
         """Degrees of freedom: outputs that count, less starts and parameters."""
         s = self.samples
-        return 2 * len(s) + int(s.free.sum()) - 3 * int(s.begins.sum()) - COUNT
+        return 2 * len(s) + int(s.free.sum()) - 3 * int(s.begins.sum()) - len(self.start)
 
     def solve(self, x: Array, weight: Array) -> Array:
         """Least squares, with what was known before as one more residual each."""
@@ -103,7 +124,7 @@ class Problem:
             return np.append(self.residual(x, weight), (x - self.start) / self.wide)
 
         def slope(x: Array) -> Array:
-            J = self.jacobian(x, weight).reshape(-1, COUNT)
+            J = self.jacobian(x, weight).reshape(-1, len(x))
             return np.concatenate([J, np.diag(1.0 / self.wide)])
 
         scale = np.minimum(self.wide, 1.0)
@@ -124,7 +145,10 @@ def problem(samples: Samples, motor: MotorModel, shaft: Shaft) -> Problem:
     first = np.array([motor.R_s, motor.L_d, motor.L_q, motor.psi_f, motor.J, motor.B_f, shaft.coulomb, 0.0])
     wide = np.array([WIDE, WIDE, WIDE, WIDE, WIDE, 1.0, 1.0, 1e-9 if one_way else 1.0])
     first[LOAD] = 0.0 if one_way else shaft.load
-    start = np.where(LOGS, np.log(np.where(LOGS, first, 1.0)), first / unit)
+    if shaft.saturation > 0.0:
+        first, unit, wide = np.append(first, shaft.saturation), np.append(unit, 1.0), np.append(wide, WIDE)
+    logs = LOGS[: len(first)]
+    start = np.where(logs, np.log(np.where(logs, first, 1.0)), first / unit)
     return Problem(samples, float(motor.n_p), start, unit, wide)
 
 
@@ -160,15 +184,16 @@ def _judged(one: Problem, x: Array, weight: Array) -> Fit:
     r, jacobian = one.residual(x, weight), one.jacobian(x, weight)
     cov, freedom = covariance(jacobian, r, one.samples, 1.0 / one.wide**2, one.used)
     deviation = np.sqrt(np.diag(cov))
-    value = one.motor(x)[:COUNT]
-    half = float(student.ppf(0.5 + LEVEL / 2, freedom)) * deviation * np.where(LOGS, value, one.unit)
+    value = one.motor(x)[: len(x)]
+    quantile = float(student.ppf(0.5 + LEVEL / 2, freedom))
+    half = quantile * deviation * np.where(LOGS[: len(x)], value, one.unit)
     residual = r / weight
     free = one.samples.free
     sigma = np.sqrt(np.mean(residual**2, axis=0))
     sigma[0] = np.sqrt(np.mean(residual[free, 0] ** 2)) if free.any() else np.nan
     told = 1.0 - np.minimum(deviation / one.wide, 1.0)
     out, white = one.samples.y - residual, whiteness(residual, one.samples)
-    return Fit(value, half, told, residual, sigma, out, white)
+    return Fit(value, half, told, residual, sigma, out, white, quantile**2 * cov)
 
 
 def covariance(J: Array, r: Array, samples: Samples, prior: Array, used: int) -> tuple[Array, float]:
@@ -199,8 +224,27 @@ def whiteness(residual: Array, samples: Samples, lags: int = 20) -> Array:
     return out
 
 
-def frozen(samples: Samples, motor: MotorModel, sigma: Array) -> Array:
+def bending(samples: Samples, motor: MotorModel, shaft: Shaft, sigma: Array) -> float:
+    """Saturation of L_q [1/A2] that the residuals of a fit without it ask for, in one step; 0: none.
+
+    ``motor`` and ``shaft`` are the fit's, ``sigma`` (3,) its deviations. A score test: the slope towards
+    saturation is one column more of the Jacobian, whose coefficient must be SURE of its deviations off 0.
+    """
+    one, weight = problem(samples, motor, shaft), 1.0 / np.maximum(np.nan_to_num(sigma, nan=1.0), 1e-12)
+    peak = float(np.abs(samples.y[:, 1]).max())
+    r, J = one.residual(one.start, weight), one.jacobian(one.start, weight)
+    trial = problem(samples, motor, replace(shaft, saturation=1e-4 / peak**2))
+    slope = (trial.residual(trial.start, weight) - r) / 1e-4
+    whole = np.concatenate([J, slope[:, :, None]], axis=2)
+    prior = np.append(1.0 / one.wide**2, 0.0)
+    flat, s2 = whole.reshape(-1, whole.shape[2]), float((r * r).sum()) / max(one.used - 1, 1)
+    inverse = np.linalg.inv(flat.T @ flat / s2 + np.diag(prior))
+    step, deviation = -float((inverse @ flat.T @ r.reshape(-1))[-1]) / s2, float(np.sqrt(inverse[-1, -1]))
+    return step / peak**2 if step > max(SURE * deviation, BENDS) else 0.0
+
+
+def frozen(samples: Samples, motor: MotorModel, sigma: Array, saturation: float = 0.0) -> Array:
     """Residuals over ``sigma`` (N, 3) of a motor that is given, the speed as measured throughout."""
     as_measured = replace(samples, free=np.zeros(len(samples), bool))
-    one = problem(as_measured, motor, Shaft())
+    one = problem(as_measured, motor, Shaft(saturation=saturation))
     return one.residual(one.start, 1.0 / np.nan_to_num(sigma, nan=1.0))

@@ -32,6 +32,7 @@ from hil.identify.estimate import (
     falling,
     thinned,
 )
+from hil.identify.facts import note_facts
 from hil.identify.inner import TAU, B, C, Drive, G, InnerFit, L, at_delay, best_delay, fit, residual_of
 from hil.identify.model import Flags
 from hil.identify.shaft import calm, rough, times
@@ -55,8 +56,11 @@ def estimate_for(config: RunConfig, motor: MotorTable, runs: Sequence[TickArray]
     """What the runs tell of the motor of a configuration, by what its drive takes."""
     T_s = 1.0 / config.loop.rate_hz
     if config.drive.takes == "voltage":
-        return of_voltages.estimate(runs, T_s, motor_model(motor))
-    return estimate(runs, config, motor)
+        out = of_voltages.estimate(runs, T_s, motor_model(motor))
+    else:
+        out = estimate(runs, config, motor)
+    note_facts(out, runs)
+    return out
 
 
 def estimate(runs: Sequence[TickArray], config: RunConfig, motor: MotorTable) -> Estimate:

@@ -5,8 +5,10 @@ State x = (w, i_q, i_d) under a voltage that is constant over a period, T_c the 
     L_q di_q/dt = u_q - R_s i_q - n_p w (L_d i_d + psi_f)
     L_d di_d/dt = u_d - R_s i_d + n_p w L_q i_q
 In the products the measured w and i_d stand, their mean over the period; all else is simulated, so that the
-back-EMF carries no noise of the speed. That is linear in where a segment starts: each sample is a forced
-response and one column for each start. Where the shaft may stick, the measured speed is taken throughout.
+back-EMF carries no noise of the speed. Where L_q saturates, i_q = phi + SATURATION phi^3, phi = psi_q / L_q:
+in di_q/dt stands the secant of psi_q between the measured ends of the period, for psi_q their chord times the
+simulated i_q. That is linear in where a segment starts: each sample is a forced response and one column for
+each start. Where the shaft may stick, the measured speed is taken throughout.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from hil.control.linalg import Array
 
 Flags = npt.NDArray[np.bool_]
 TERMS: Final = 8
-R_S, L_D, L_Q, PSI_F, J, B_F, COULOMB, LOAD, N_P = range(9)
+R_S, L_D, L_Q, PSI_F, J, B_F, COULOMB, LOAD, SATURATION, N_P = range(10)
 """Places of the parameters in the model's vector."""
 
 
@@ -64,13 +66,35 @@ def sampled(A: Array, T: float, E: Array, I: Array, work: Array) -> None:  # noq
 
 
 @jit
-def fill_matrix(p: Array, w: float, i_d: float, free: bool, A: Array) -> None:
-    """A at the speed and the i_d of a period; with the speed given its row is zero."""
-    n_p = p[N_P]
+def unsaturated(i: float, saturation: float) -> float:
+    """phi [A] of i = phi + saturation phi^3, in closed form."""
+    if saturation == 0.0:
+        return i
+    root = math.sqrt(saturation)
+    y = 1.5 * math.sqrt(3.0) * root * i
+    return 2.0 / math.sqrt(3.0) * math.sinh(math.asinh(y) / 3.0) / root
+
+
+@jit
+def inductances(p: Array, before: float, after: float) -> tuple[float, float]:
+    """Secant and chord of psi_q over i_q [H] in a period between two measured i_q."""
+    s = p[SATURATION]
+    if s == 0.0:
+        return p[L_Q], p[L_Q]
+    a, b = unsaturated(before, s), unsaturated(after, s)
+    secant = p[L_Q] / (1.0 + s * (a * a + a * b + b * b))
+    middle = 0.5 * (a + b)
+    return secant, p[L_Q] / (1.0 + s * middle * middle)
+
+
+@jit
+def fill_matrix(p: Array, w: float, i_d: float, L: tuple[float, float], free: bool, A: Array) -> None:
+    """A at the speed and the i_d of a period; with the speed given its row is zero. ``L``: of psi_q."""
+    n_p, (L_q, chord) = p[N_P], L
     A[0, 0] = -p[B_F] / p[J] if free else 0.0
-    A[0, 1] = 1.5 * n_p * (p[PSI_F] + (p[L_D] - p[L_Q]) * i_d) / p[J] if free else 0.0
-    A[1, 0], A[1, 1], A[1, 2] = -n_p * p[PSI_F] / p[L_Q], -p[R_S] / p[L_Q], -n_p * w * p[L_D] / p[L_Q]
-    A[2, 1], A[2, 2] = n_p * w * p[L_Q] / p[L_D], -p[R_S] / p[L_D]
+    A[0, 1] = 1.5 * n_p * (p[PSI_F] + (p[L_D] - chord) * i_d) / p[J] if free else 0.0
+    A[1, 0], A[1, 1], A[1, 2] = -n_p * p[PSI_F] / L_q, -p[R_S] / L_q, -n_p * w * p[L_D] / L_q
+    A[2, 1], A[2, 2] = n_p * w * chord / p[L_D], -p[R_S] / p[L_D]
 
 
 @jit
@@ -96,14 +120,15 @@ def responses(p: Array, T: float, y: Array, u: Array, begins: Flags, free: Flags
             begin(y[k, 0], free[k], z[k])
             continue
         w, i_d = 0.5 * (y[k - 1, 0] + y[k, 0]), 0.5 * (y[k - 1, 2] + y[k, 2])
-        fill_matrix(p, w, i_d, free[k], A)
+        L = inductances(p, y[k - 1, 1], y[k, 1])
+        fill_matrix(p, w, i_d, L, free[k], A)
         sampled(A, T, E, I, work)
         way = 1.0 if w > 0.0 else -1.0
         c[0] = -(p[COULOMB] * way + p[LOAD]) / p[J] if free[k] else (y[k, 0] - y[k - 1, 0]) / T
-        c[1], c[2] = u[k, 0] / p[L_Q], u[k, 1] / p[L_D]
+        c[1], c[2] = u[k, 0] / L[0], u[k, 1] / p[L_D]
         if not free[k]:  # mean of w over the period by both ends and the torque's change: T^2 w'' / 12 less
             bend = T * 1.5 * p[N_P] * p[PSI_F] / p[J] * (y[k, 1] - y[k - 1, 1]) / 12.0
-            c[1] += p[N_P] * p[PSI_F] * bend / p[L_Q]
+            c[1] += p[N_P] * p[PSI_F] * bend / L[0]
         for i in range(3):
             for n in range(4):
                 z[k, n, i] = E[i, 0] * z[k - 1, n, 0] + E[i, 1] * z[k - 1, n, 1] + E[i, 2] * z[k - 1, n, 2]

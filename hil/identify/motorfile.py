@@ -42,7 +42,10 @@ def _interval_lines(found: Estimate, end: str) -> list[str]:
     for name, key in KEYS.items():
         p = found.parameters.get(name)
         if p is not None and p.told:
-            lines.append(f"{key} = {number(getattr(p, end))}")
+            value = getattr(p, end)
+            if name == "L_q" and end == "low":  # a saturating one is between both
+                value = min([value, *(row["low"] for row in found.saturation)])
+            lines.append(f"{key} = {number(value)}")
     return lines
 
 
@@ -68,6 +71,8 @@ def _extra(found: Estimate) -> dict[str, Any]:
     currents = [p[name].value for name in ("i_q_noise", "i_d_noise") if name in p]
     if currents:
         out["i_noise_a"] = number(math.hypot(*currents) / math.sqrt(len(currents)))
+    if "L_q_saturation" in p:
+        out["L_q_saturation_a"] = number(p["L_q_saturation"].value)
     if "delay" in p:
         out["delay_ticks"] = round(p["delay"].value)
     return out

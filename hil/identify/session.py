@@ -12,9 +12,11 @@ from typing import Any, Final
 from hil.config.motor import MotorTable
 from hil.config.tables import RunConfig
 from hil.control.errors import ControlDesignError
+from hil.control.linalg import Array
 from hil.errors import ConfigError, HilError
 from hil.identify.checks import breakaway, seen_in
 from hil.identify.estimate import Estimate, known_k_t
+from hil.identify.facts import arrivals, offsets
 from hil.identify.innerloop import estimate_for
 from hil.identify.motorfile import motor_of, toml_of
 from hil.identify.plan import Skipped, Step, config_of, make
@@ -43,6 +45,7 @@ class Session:
     findings: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     estimate: Estimate = field(default_factory=Estimate)
+    offsets: list[dict[int, Array]] = field(default_factory=list)
     ended: bool = False
 
     @property
@@ -66,6 +69,7 @@ class Session:
         """JSON form."""
         return {
             **self.estimate.as_dict(),
+            "arrivals": arrivals(self.offsets),
             "config": str(self.path),
             "steps": self.steps,
             "logs": self.logs,
@@ -121,7 +125,9 @@ def identify(
         request = requesting()
         result = run(setup_for(session, step), arm=arm, request=request)
         session.steps.append(_row(step, result, config))
-        ticks = open_log(Path(result.log), frames=False).ticks
+        log = open_log(Path(result.log))
+        ticks = log.ticks
+        session.offsets.append(offsets(log))
         if not _as_planned(session, step, result, request):
             break
         session.note(step, ticks)

@@ -20,6 +20,10 @@ HANGS = 'load=[{kind="constant",torque_n_m=0.15}]'
 NO_LOAD = "load=[]"
 WEAK = 'firmware={takes="current",i_limit_a=1.0}'
 LOW = "inverter={v_dc_v=60.0}"
+SALIENT = (
+    "motor={R_s_ohm=3.45, L_d_h=0.0297, L_q_h=0.04, psi_f_wb=0.76, n_p=3, J_kg_m2=0.01265, B_f_n_m_s=4e-4, "
+    "L_q_saturation_a=8.0}"
+)
 FEW_VOLTS = ("limits.v_dc_min_v=20.0",)
 
 
@@ -88,3 +92,38 @@ def test_a_supply_that_limits_is_ridden_through_with_wider_intervals() -> None:
     assert min(wider) > 1.0 and np.isfinite(wider).all()
     b_f = found["B_f"]
     assert not b_f.told and "friction falls with speed" in b_f.why and session.motor.B_f_n_m_s == 2e-4
+
+
+def test_an_echo_that_lags_is_named_and_told_in_ticks() -> None:
+    """The ticks of a drive that echoes each command a period after it has taken it."""
+    config = load_toml(CONFIGS / "demo.toml", RunConfig, ())
+    session = Session(CONFIGS / "demo.toml", config, config.motor)
+    (step,) = planned(session, ("standstill",))
+    ticks = simulate_ticks(setup_for(session, step), [NO_LOAD])
+    session.note(step, ticks)
+    p = session.estimate.parameters
+    assert (p["echo_lag"].value, p["delay"].value) == (0.0, 1.0) and p["echo_lag"].told
+    assert not any("echo" in line for line in session.estimate.findings)
+    late = Session(CONFIGS / "demo.toml", config, config.motor)
+    for name in ("ua_q", "ua_d"):
+        ticks[name] = np.append(0.0, ticks[name][:-1])
+    late.note(step, ticks)
+    p = late.estimate.parameters
+    assert (p["echo_lag"].value, p["delay"].value) == (1.0, 1.0) and p["echo_lag"].told
+    assert any("the echo of the commands lags" in line for line in late.estimate.findings)
+
+
+def test_a_saturating_l_q_is_named_and_told_at_several_currents() -> None:
+    session = seen("demo", ("standstill",), NO_LOAD, SALIENT)
+    p, rows = session.estimate.parameters, session.estimate.saturation
+    assert session.faults == [] and any("L_q saturates" in line for line in session.estimate.findings)
+    assert p["L_q"].value == pytest.approx(0.04, rel=0.02) and p["L_d"].value == pytest.approx(
+        0.0297, rel=0.02
+    )
+    assert p["R_s"].value == pytest.approx(3.45, rel=0.02)
+    assert p["L_q_saturation"].value == pytest.approx(8.0, rel=0.05)
+    assert [row["told"] for row in rows] == [True] * 3
+    assert rows[2]["i_q_a"] > 3.0 and rows[2]["high"] < rows[1]["low"] < rows[1]["high"] < rows[0]["low"]
+    for row in rows[1:]:  # i_q = phi + phi^3 / 4^2, psi_q = L_q phi
+        phi = 0.04**-1 * row["value"] * row["i_q_a"]
+        assert phi + phi**3 / 16.0 == pytest.approx(row["i_q_a"], rel=0.02)
