@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
+from firmware_model.coupling import Coupling, Masses
 from firmware_model.dialects import dialect, dialects
 from firmware_model.faults import ExtraLoad, Fault
 from firmware_model.loads.step import StepLoad
@@ -294,6 +295,8 @@ class PlantConfig(Table):
     """Protection of the drive itself."""
     friction: Friction = Friction()
     """Dry friction of the shaft."""
+    coupling: Coupling | None = None
+    """A soft coupling between motor and load; left out: the shaft is rigid."""
     disturbance: Disturbance = Disturbance()
     """Unknown constants of (33)."""
     load: list[Load] = Field(default=[], max_length=MAX_LOADS)
@@ -302,6 +305,12 @@ class PlantConfig(Table):
     """What goes wrong, and when."""
     black_box: bool = False
     """Keep what the drive did for hil faults to judge."""
+
+    @property
+    def masses(self) -> Masses:
+        """The inertias before and behind the coupling."""
+        J = self.motor.J_kg_m2
+        return Masses(J) if self.coupling is None else self.coupling.masses(J)
 
     @property
     def all_loads(self) -> list[Any]:
@@ -313,6 +322,14 @@ class PlantConfig(Table):
     def _has_its_eds(self) -> PlantConfig:
         if bool(self.eds) != dialect(self.protocol).eds:
             raise ValueError('eds and a protocol that needs one, as "cia402", belong together')
+        return self
+
+    @model_validator(mode="after")
+    def _has_two_ends(self) -> PlantConfig:
+        try:
+            _ = self.masses
+        except ValueError as error:
+            raise ValueError(f"coupling: {error}") from None
         return self
 
     @model_validator(mode="after")

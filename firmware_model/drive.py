@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from firmware_model.coupling import load_speed
 from firmware_model.current import refer, regulate
 from firmware_model.jit import jit
 from firmware_model.link import link_voltage
 from firmware_model.load import edge_after, load_torque
 from firmware_model.motor import move
-from firmware_model.plant import ANGLE, PROTOCOL_VERSION, ErrorCode, State
+from firmware_model.plant import ANGLE, LOAD_SPEED, PROTOCOL_VERSION, TWIST, ErrorCode, State
 from firmware_model.rub import friction_torque, rub
 from firmware_model.sensors import measure, to_turn, whole_degrees
 from firmware_model.speedfilter import track
@@ -49,6 +50,7 @@ def protect(p: Any, s: Any) -> None:
     x = s["x"]
     if not (math.isfinite(x[0]) and math.isfinite(x[1]) and math.isfinite(x[2])):
         x[0] = 0.0
+        s["series"][LOAD_SPEED, 0], s["series"][TWIST, 0] = 0.0, 0.0
         trip(s, ErrorCode.OVER_SPEED.value)
     if x[1] * x[1] + x[2] * x[2] > p["i_trip"] * p["i_trip"]:
         trip(s, ErrorCode.OVER_CURRENT.value)
@@ -207,7 +209,9 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     t = s["t_ns"] * 1e-9
     out["T_L_true"] = np.float64(
         np.float32(
-            load_torque(p, t, x[0], s["series"][ANGLE, 0]) + s["T_commanded"] + friction_torque(p, s, t)
+            load_torque(p, t, load_speed(p, s), s["series"][ANGLE, 0])
+            + s["T_commanded"]
+            + friction_torque(p, s, t)
         )
     )
     out["w_true"] = np.float64(np.float32(x[0]))

@@ -31,11 +31,13 @@ from firmware_model.faults import (
     PhaseLoss,
 )
 from firmware_model.jit import jit
-from firmware_model.plant import ErrorCode, State
+from firmware_model.plant import ANGLE, LOAD_SPEED, TWIST, ErrorCode, State
 from firmware_model.sensors import to_wire
 
 OPEN_PHASE_STEP_NS: Final = 50_000
 _KEPT: Final = ("t_ns", "started", "temperature", "random", "syncs")
+_SHAFT: Final = (ANGLE, LOAD_SPEED, TWIST)
+"""Rows of the series whose coefficients 0 are states of the shaft: a supply that fails leaves them."""
 _MEASURED: Final = (("w", "w_lsb", "w_top"), ("i_q", "i_q_lsb", "i_q_top"), ("i_d", "i_d_lsb", "i_d_top"))
 
 
@@ -155,6 +157,8 @@ class PlantFaults:
             for name in _KEPT:
                 fresh[name] = s[name]
             fresh["x"][0] = s["x"][0]
+            for row in _SHAFT:
+                fresh["series"][row, 0] = s["series"][row, 0]
             for name in fresh.dtype.names:
                 s[name] = fresh[name]
         return came

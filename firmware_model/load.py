@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from firmware_model.jit import inlined, jit
-from firmware_model.plant import ANGLE, QUADRATURE, code_of
+from firmware_model.plant import ANGLE, LOAD_SPEED, QUADRATURE, code_of
 from firmware_model.registry import Kernel, Load, loads
 
 
@@ -73,6 +73,15 @@ def load_torque(p: Any, t: float, w: float, theta: float = 0.0) -> float:
 
 
 @jit
+def turned_load(p: Any, theta: float) -> float:
+    """The part of it that goes by the shaft's angle."""
+    total = 0.0
+    for j in range(p["loads"]):
+        total += turned_of(p["load"][j], theta)
+    return total
+
+
+@jit
 def held_load(p: Any, t: float) -> float:
     """Sum of the loads that are constant over the substep about its middle t [s]."""
     total = 0.0
@@ -82,19 +91,22 @@ def held_load(p: Any, t: float) -> float:
 
 
 @jit
-def varying_load(p: Any, c: Any, t: float, k: int) -> float:
-    """Coefficient k of the sum of the loads that vary; each load's own goes to its row of ``c``.
+def varying_load(p: Any, c: Any, t: float, k: int) -> tuple[float, float]:
+    """Coefficient k of the sum of the loads that vary, and the part of it that goes by the shaft's angle.
 
-    Rows of ``c``: w, i_q, i_d, loads.
+    Each load's own goes to its row of ``c``: w, i_q, i_d, loads. Behind a soft coupling they have its speed.
     """
-    total = 0.0
+    total, by_angle = 0.0, 0.0
+    turning = LOAD_SPEED if p["J_load"] > 0.0 else 0
     if p["turns"] and k > 0:
         c[ANGLE, k] = c[0, k - 1] / k
     for j in range(p["loads"]):
-        c[3 + j, k] = coefficient_of(p["load"][j], c[3 + j], c[0], t, k)
-        c[3 + j, k] += angular_of(p["load"][j], c[3 + j], c[QUADRATURE + j], c[ANGLE], k)
+        c[3 + j, k] = coefficient_of(p["load"][j], c[3 + j], c[turning], t, k)
+        angular = angular_of(p["load"][j], c[3 + j], c[QUADRATURE + j], c[ANGLE], k)
+        c[3 + j, k] += angular
         total += c[3 + j, k]
-    return total
+        by_angle += angular
+    return total, by_angle
 
 
 @jit

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from firmware_model.coupling import far_end, twisted
 from firmware_model.friction import exponential, level, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import held_load, varying_load
@@ -58,13 +59,14 @@ def series(
     """Coefficients of w, i_q, i_d [unit / s^k] about t [s] in rows 0 to 2 of ``c``, for a step of h [s].
 
     With the gates off no current flows and only the shaft moves. With friction the shaft slides the way that
-    row SLIDE says, or sticks; what drives it then goes to row DRIVE.
+    row SLIDE says, or sticks; what drives it then goes to row DRIVE. A soft coupling has its own two rows.
     """
     m = constants(p)
     inverse_J = m[-3]
     w, q, d = c[0], c[1], c[2]
     w[0], q[0], d[0] = x[0], x[1], x[2]
-    added = held(p, m, held_load(p, t + 0.5 * h) + T_commanded, u_q, u_d)
+    soft, T_held = p["J_load"] > 0.0, held_load(p, t + 0.5 * h) + T_commanded
+    added = held(p, m, 0.0 if soft else T_held, u_q, u_d)
     slide, T_coulomb = (c[SLIDE, 0], level(p, t + 0.5 * h)) if p["rubs"] else (1.0, 0.0)
     saturates = p["L_q_saturation"] > 0.0
     if saturates:
@@ -76,7 +78,11 @@ def series(
             bent_w, bent_d = bend(m, c, k)
             dw, dd = dw + bent_w, dd + bent_d
         if p["varying"]:
-            dw -= varying_load(p, c, t, k) * inverse_J
+            T_L, T_angle = varying_load(p, c, t, k)
+            if soft:
+                behind = T_L - T_angle + (T_held if k == 0 else 0.0)
+                T_L = T_angle + twisted(p, c, behind, k)
+            dw -= T_L * inverse_J
         if k == 0:
             dw, dq, dd = dw + added[0], dq + added[1], dd + added[2]
         if p["rubs"]:
@@ -159,16 +165,23 @@ def rubbed_series(p: Any, x: Any, T_held: float, u_q: float, u_d: float, on: boo
 
 
 @jit
+def arrive(p: Any, x: Any, c: Any, h: float) -> None:
+    """The states at the end of h [s], from the series in ``c``: x, the angle, what a coupling has."""
+    for i in range(3):
+        x[i] = evaluate(c[i], h)
+    if p["turns"]:
+        c[ANGLE, 0] += integral(c[0], h)
+    far_end(p, c, h)
+
+
+@jit
 def move(
     p: Any, x: Any, c: Any, t: float, h: float, u_q: float, u_d: float, T_commanded: float, on: bool
 ) -> None:
     """Advance x = (w, i_q, i_d) by h [s] in place; ``c`` is room for the coefficients."""
     if p["varying"]:
         series(p, x, c, t, h, u_q, u_d, T_commanded, on)
-        for i in range(3):
-            x[i] = evaluate(c[i], h)
-        if p["turns"]:
-            c[ANGLE, 0] += integral(c[0], h)
+        arrive(p, x, c, h)
         return
     w, q, d = plain_series(p, x, held_load(p, t + 0.5 * h) + T_commanded, u_q, u_d, on)
     x[0], x[1], x[2] = evaluate(w, h), evaluate(q, h), evaluate(d, h)

@@ -27,7 +27,9 @@ QUADRATURE: Final = ANGLE + 1
 """First of the rows, one a load, for the quarter turn ahead of a load that goes by the angle."""
 FLUX, SQUARE, EXCESS = range(QUADRATURE + MAX_LOADS, QUADRATURE + MAX_LOADS + 3)
 """Rows of a saturated q axis: phi = psi_q / L_q, its square, i_q - phi (:mod:`firmware_model.saturation`)."""
-ROWS: Final = EXCESS + 1
+LOAD_SPEED, TWIST = EXCESS + 1, EXCESS + 2
+"""Rows of a soft coupling, whose coefficients 0 are the states themselves: speed of the load, twist [rad]."""
+ROWS: Final = TWIST + 1
 PROTOCOL_VERSION: Final = 1
 
 
@@ -121,7 +123,8 @@ def _speed_filter(firmware: Any) -> dict[str, float]:
 
 def _varies(config: Any) -> bool:
     """True for what the series without rows of its own has no room for."""
-    return config.motor.L_q_saturation_a is not None or has(config, "coefficient") or has(config, "angular")
+    rows = config.motor.L_q_saturation_a is not None or config.coupling is not None
+    return rows or has(config, "coefficient") or has(config, "angular")
 
 
 PARAMETERS: Final = {
@@ -131,11 +134,11 @@ PARAMETERS: Final = {
     "L_q_saturation": Parameter(lambda c, w: c.motor.L_q_saturation_a or 0.0, "A"),
     "psi_f": Parameter(lambda c, w: c.motor.psi_f_wb, "Wb"),
     "n_p": Parameter(lambda c, w: c.motor.n_p),
-    "J": Parameter(lambda c, w: c.motor.J_kg_m2, "kg m2"),
+    "J": Parameter(lambda c, w: c.masses.J_m, "kg m2"),
     "B_f": Parameter(lambda c, w: c.motor.B_f_n_m_s, "N m s"),
     "phi_w": Parameter(lambda c, w: c.disturbance.phi_w_rad_s2, "rad/s2"),
     "phi_q": Parameter(lambda c, w: c.disturbance.phi_q_a_s, "A/s"),
-    "substep_ns": Parameter(lambda c, w: c.substep_us * 1000, "ns", "i8"),
+    "substep_ns": Parameter(lambda c, w: min(c.substep_us * 1000, c.masses.substep_ns), "ns", "i8"),
     "v_dc": Parameter(lambda c, w: c.inverter.v_dc_v, "V"),
     "u_lsb": Parameter(lambda c, w: c.inverter.resolution_v, "V"),
     "w_lsb": Parameter(lambda c, w: w.w_lsb, "rad/s"),
@@ -169,6 +172,9 @@ PARAMETERS: Final = {
     "brake_on": Parameter(lambda c, w: c.inverter.brake_on_v, "V"),
     "brake_off": Parameter(lambda c, w: c.inverter.brake_off_v or 0.0, "V"),
     "v_trip": Parameter(lambda c, w: c.inverter.v_dc_trip_v, "V"),
+    "J_load": Parameter(lambda c, w: c.masses.J_l, "kg m2"),
+    "stiffness": Parameter(lambda c, w: c.masses.c, "N m/rad"),
+    "damping": Parameter(lambda c, w: c.masses.d, "N m s/rad"),
     "takes": Parameter(lambda c, w: Takes[c.firmware.takes.upper()], "", "i8"),
     "drive_k_t": Parameter(_loop(lambda c: c.firmware.torque_constant_n_m_a or c.motor.k_t_n_m_a), "N m/A"),
     "i_limit": Parameter(_loop(lambda c: c.firmware.i_limit_a), "A"),
@@ -186,11 +192,11 @@ PARAMETERS: Final = {
 """Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
 
 ``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported. ``turns``: the angle is kept. ``varying``: a
-load changes within a substep, or the q axis saturates (``L_q_saturation`` 0: not); ``rubs`` 0: no friction,
-no brake; ``capacitance`` 0: the DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a
-command is (:class:`Takes`); gains and shares of reset are those of the sampled current loop; ``filter`` is
-of the speed (:class:`Filter`), with its poles, or the samples
-of a mean and their period.
+load changes within a substep, the q axis saturates (``L_q_saturation`` 0: not) or the coupling is soft
+(``J_load`` 0: not, and ``J`` is all of the inertia); ``rubs`` 0: no friction, no brake; ``capacitance`` 0: the
+DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a command is (:class:`Takes`); gains
+and shares of reset are those of the sampled current loop; ``filter`` is of the speed (:class:`Filter`), with
+its poles, or the samples of a mean and their period.
 """
 _NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
 LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)

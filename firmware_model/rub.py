@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from firmware_model.coupling import coupling_torque
 from firmware_model.friction import level
 from firmware_model.jit import jit
 from firmware_model.link import advance_held_link, advance_link
-from firmware_model.load import held_load, load_torque
-from firmware_model.motor import rubbed_series, series
-from firmware_model.plant import ANGLE, DRIVE, POWER, SLIDE, STRIBECK
+from firmware_model.load import held_load, load_torque, turned_load
+from firmware_model.motor import arrive, rubbed_series, series
+from firmware_model.plant import ANGLE, DRIVE, LOAD_SPEED, POWER, SLIDE, STRIBECK, TWIST
 from firmware_model.saturation import flux_of
 from firmware_model.series import ORDER, evaluate, first_crossing, integral, within
 
@@ -30,11 +31,14 @@ PIECES = 1000
 @jit
 def drive_torque(p: Any, s: Any, t: float) -> float:
     """Torque on the shaft without friction [N m], at t [s]."""
-    x = s["x"]
+    x, c = s["x"], s["series"]
     electric = 1.5 * p["n_p"] * (p["psi_f"] + (p["L_d"] - p["L_q"]) * x[2]) * x[1]
     if p["L_q_saturation"] > 0.0:
         electric += 1.5 * p["n_p"] * p["L_q"] * (x[1] - flux_of(p, x[1])) * x[2]
-    load = load_torque(p, t, x[0], s["series"][ANGLE, 0]) + s["T_commanded"]
+    if p["J_load"] > 0.0:
+        load = coupling_torque(p, c[TWIST, 0], x[0] - c[LOAD_SPEED, 0]) + turned_load(p, c[ANGLE, 0])
+    else:
+        load = load_torque(p, t, x[0], c[ANGLE, 0]) + s["T_commanded"]
     return float(electric - p["B_f"] * x[0] - load + p["J"] * p["phi_w"])
 
 
@@ -147,12 +151,9 @@ def rub(p: Any, s: Any, t: float, h: float, on: bool) -> None:
         step = piece(p, c, most, left) if p["rubs"] and n < PIECES - 1 else left
         for k in range(ORDER + 1):
             c[POWER, k] = 1.5 * (s["u_q"] * c[1, k] + s["u_d"] * c[2, k]) if on else 0.0
-        for i in range(3):
-            x[i] = evaluate(c[i], step)
+        arrive(p, x, c, step)
         if p["rubs"] and c[SLIDE, 0] * x[0] <= 0.0:
             x[0] = 0.0
-        if p["turns"]:
-            c[ANGLE, 0] += integral(c[0], step)
         if p["capacitance"] > 0.0:
             advance_link(p, s, c, step)
         t, left = t + step, left - step

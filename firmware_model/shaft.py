@@ -30,6 +30,7 @@ def refuse_uncoupled(plants: dict[str, PlantConfig]) -> None:
     """Raise PlantError for what only a shaft of one motor can have."""
     for name, plant in plants.items():
         has = {
+            "coupling": plant.coupling is not None,
             "friction": plant.friction.most_n_m > 0.0,
             "motor.L_q_saturation_a": plant.motor.L_q_saturation_a is not None,
             "a load that only holds (brake)": any(load.kind == "brake" for load in plant.load),
@@ -73,7 +74,7 @@ def share(p: Any, s: Any, m: Any, t: float, k: int, on: bool) -> Any:
     c = s["series"]
     dw, dq, dd = slopes(m, c[0], c[1], c[2], k)
     if p["varying"]:
-        dw -= varying_load(p, c, t, k) * m[-3]
+        dw -= varying_load(p, c, t, k)[0] * m[-3]
     return (dw, dq, dd) if on else (dw, 0.0, 0.0)
 
 

@@ -7,6 +7,8 @@ from typing import Final
 UNITS: Final = {
     "_rad_s3": "rad/s^3",
     "_rad_s2": "rad/s^2",
+    "_n_m_s_rad": "N m s/rad",
+    "_n_m_rad": "N m/rad",
     "_n_m_s2": "N m s^2",
     "_n_m_s": "N m s",
     "_n_m_a": "N m/A",
@@ -68,6 +70,8 @@ NUMBERS: Final = (
     "node_id",
     "seed",
     "damping",
+    "damping_ratio",
+    "inertia_ratio",
     "share",
     "voltage_share",
 )
