@@ -1,4 +1,4 @@
-"""A soft coupling from the command line: the demo, simulation and bus alike, a campaign's key, refusals."""
+"""A soft coupling from the command line: its keys as settings and axes, refusals."""
 
 from __future__ import annotations
 
@@ -6,13 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from hil.cli import main
-from hil.runtime.setup import Overrides, load_setup
-from hil.sim.simulate import simulate_ticks
-from tests.process.test_run import Settings, flags, only_log
 
 SOFT = """
 [coupling]
@@ -34,27 +30,8 @@ def run(capsys: pytest.CaptureFixture[str], *words: str) -> Any:
     return json.loads(capsys.readouterr().out)
 
 
-@pytest.mark.process
-def test_the_demo_runs_a_soft_shaft_and_simulation_gives_its_bits(
-    configs: Path, settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from hil.log.reader import open_log
-
-    own = settings("loop.duration_s=3.0", 'loop.clock="lockstep"')
-    rigid = simulate_ticks(load_setup(configs / "demo.toml", Overrides(settings=own)))
-    path = soft(configs)
-    run(capsys, "demo", str(path), *flags(own))
-    log = open_log(only_log(tmp_path))
-    assert "resonance_hz = 60.0" in log.attachment("plant.toml")
-    bus, ticks = log.ticks, simulate_ticks(load_setup(path, Overrides(settings=own)))
-    assert len(bus) == len(ticks) == len(rigid)
-    for name in ("w", "i_q", "u_q", "T_L_true", "state"):
-        assert (bus[name] == ticks[name]).all(), name
-    assert np.abs(rigid["w"] - ticks["w"]).max() > 0.05
-
-
 def test_keys_of_the_coupling_are_settings_and_axes_as_any(
-    configs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    configs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = soft(configs)
     plain = run(capsys, "simulate", str(path), "--no-log", "--plant-set", "coupling.resonance_hz=25")
