@@ -194,9 +194,9 @@ PARAMETERS: Final = {
 ``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported. ``turns``: the angle is kept. ``varying``: a
 load changes within a substep, the q axis saturates (``L_q_saturation`` 0: not) or the coupling is soft
 (``J_load`` 0: not, and ``J`` is all of the inertia); ``rubs`` 0: no friction, no brake; ``capacitance`` 0:
-the DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a command is (:class:`Takes`); gains
-and shares of reset are those of the sampled current loop; ``filter`` is of the speed (:class:`Filter`), with
-its poles, or the samples of a mean and their period.
+the DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a command is (:class:`Takes`);
+gains and shares of reset are those of the sampled current loop; ``filter`` is of the speed
+(:class:`Filter`), with its poles, or the samples of a mean and their period.
 """
 _NUMBERS: Final = sorted({name for member in loads().values() for name in member.numbers})
 LOAD: Final = np.dtype([("kind", "i8"), *((name, "f8") for name in _NUMBERS)], align=True)
