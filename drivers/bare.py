@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+from drivers.bcm import KernelSync
 from drivers.codec import Database
 from drivers.local import open_sockets, pack_frame
 
@@ -89,6 +90,20 @@ def bare_loop(sockets: Sockets, frames: Exchange, period_ns: int, ticks: int) ->
         k, done = k + 1, done + 1
     processor_ns = time.thread_time_ns() - begin
     return BareResult(ticks, skipped, late, lost, processor_ns * 1e-3 / ticks)
+
+
+def bare_answers(sockets: Sockets, frames: Exchange, sync: KernelSync, ticks: int) -> float:
+    """The same with SYNC by the kernel's timer: feedback is waited for and answered. Processor time [us]."""
+    send, wait = sockets[1].send, _waiter(sockets[0], frames.feedback)
+    sync.start()
+    wait()
+    begin = time.thread_time_ns()
+    for done in range(ticks):
+        wait()
+        send(frames.commands[done % len(frames.commands)])
+    processor_ns = time.thread_time_ns() - begin
+    sync.close()
+    return processor_ns * 1e-3 / ticks
 
 
 def _waiter(receiving: socket.socket, feedback: bytes) -> Callable[[], bool]:

@@ -104,7 +104,7 @@ I8: Final = np.dtype(np.int64)
 ) = range(14)  # fmt: skip
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
 PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS, EVERY, TOGETHER, FOLLOWS, PLANNED = range(9)
-TOGETHER_NS: Final = 8_000_000
+TOGETHER_NS: Final = 4_000_000
 """How long ticks go on without Python: a signal that comes while none of them waits is late by so much."""
 
 

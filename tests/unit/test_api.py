@@ -15,6 +15,8 @@ import pytest
 import hil
 from tests.conftest import CONFIGS, ROOT
 
+pytestmark = pytest.mark.slow
+
 DEMO = CONFIGS / "demo.toml"
 SHORT = {"loop.duration_s": 1.0}
 PAGE = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")

@@ -30,6 +30,8 @@ from hil.tick.kernel import circle
 from tests.conftest import CONFIGS
 from tests.safety import Guard
 
+pytestmark = pytest.mark.slow
+
 N_P, PSI_F, R_S, I_MAX, U = 3, 0.8, 2.875, 15.0, 165.0
 IPM = (0.03, 0.06)
 REVERSED = (0.06, 0.03)

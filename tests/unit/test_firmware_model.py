@@ -20,6 +20,8 @@ from firmware_model.config import PlantConfig, Record, Wire, build_params, new_s
 from firmware_model.loads.coupler import coupler_torque_max
 from firmware_model.plant import ErrorCode, State
 
+pytestmark = pytest.mark.slow
+
 WIRE = Wire(0.01, 327.67, 0.001, 32.767, 0.01, 20.47)
 MOTOR = {
     "R_s_ohm": 2.0, "L_d_h": 0.02, "L_q_h": 0.033, "psi_f_wb": 0.7, "n_p": 3,

@@ -25,6 +25,8 @@ from hil.replay.ranges import RANGES
 from hil.watch import web
 from tests.golden.kept import LOGS
 
+pytestmark = pytest.mark.slow
+
 SIMULATED = LOGS / "1a4c819" / "simulate.mcap"
 PART = LOGS / "1a4c819" / "split.001.mcap"
 ESCAPE = "\x1b]0;pwned\x07\x1b[2J[red]same[/red] [/x] <script>alert(1)</script>"

@@ -19,6 +19,8 @@ from hil.identify.fit import Shaft, fit
 from hil.identify.model import COULOMB, L_D, L_Q, PSI_F, R_S, J, outputs, responses, sampled
 from hil.identify.shaft import calm, rough
 
+pytestmark = pytest.mark.slow
+
 T = 1e-3
 TRUE = MotorModel(R_s=3.45, L_d=0.0297, L_q=0.036, psi_f=0.76, n_p=3, J=0.01265, B_f=4e-3)
 GUESS = MotorModel(R_s=2.6, L_d=0.037, L_q=0.028, psi_f=0.9, n_p=3, J=0.009, B_f=1e-4)

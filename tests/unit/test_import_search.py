@@ -25,6 +25,8 @@ from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, DriveState, RxFlag, TickArray, new_ticks
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 US = 1_000
 STATES = {6: 2, 7: 3, 15: 4}

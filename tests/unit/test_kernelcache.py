@@ -15,6 +15,8 @@ import pytest
 from drivers import kernelcache
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 CALLEE = """from drivers.jit import jit
 from hil.factor import (  # the caller's kernel is made of these, too
     FACTOR,

@@ -32,6 +32,8 @@ from hil.log.schema import file_descriptor_set
 from hil.signals import TICK, new_ticks
 from tests.logfiles import HEADER, some_frames, some_ticks, write_log
 
+pytestmark = pytest.mark.slow
+
 TICKS, FRAMES, BLOCK = some_ticks(500), some_frames(2000), 50
 
 

@@ -15,6 +15,8 @@ from drivers.errors import EncodeError
 from hil.signals import new_ticks
 from tests.conftest import CONFIGS, ROOT
 
+pytestmark = pytest.mark.slow
+
 # (file, function): every place outside the links themselves that hands a frame to a link
 MAY_SEND = {
     ("drivers/client.py", "_transmit"),  # what `send` and `stop` lay out from a guarded tick, and SYNC

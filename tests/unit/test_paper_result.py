@@ -22,6 +22,8 @@ from hil.paper.study import make_study
 from hil.signals import new_ticks
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 GOLDEN = ROOT / "tests/golden/paper_verdicts.json"
 NAMES = [*(f"fig{i:02d}" for i in range(1, 16)), "fixed_time", "corrected", "price", "bench"]
 

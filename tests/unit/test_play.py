@@ -24,6 +24,8 @@ from hil.log.schema import FRAME, Records
 from hil.runtime.clock import FakeClock
 from tests.logfiles import some_ticks, write_log
 
+pytestmark = pytest.mark.slow
+
 IDS = ((0x080, 0, 1), (0x181, 1, 8), (0x201, 0, 8))
 PERIOD_NS = 1_000_000
 

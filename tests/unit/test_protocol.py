@@ -15,6 +15,8 @@ from drivers.e2e import crc_profile_2, crc_profile_5
 from drivers.errors import DatabaseError, DecodeError, EncodeError
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 CLASSIC, FD = CONFIGS / "drives" / "hil_pmsm.dbc", CONFIGS / "drives" / "hil_pmsm_fd.dbc"
 HOUSE, HOUSE_FD = Database(CLASSIC), Database(FD)
 

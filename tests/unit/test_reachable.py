@@ -17,6 +17,8 @@ from hil.runtime.refusals import check_reachable
 from hil.runtime.session import run
 from hil.runtime.setup import Overrides, load_setup
 
+pytestmark = pytest.mark.slow
+
 CASES = (
     ("reference.w_rad_s=151.0", "limits.w_max_rad_s = 150 stops it"),
     ("reference.w_rad_s=-151.0", "limits.w_max_rad_s = 150 stops it"),

@@ -23,6 +23,8 @@ from hil.tick.supervisor import is_fault
 from tests.conftest import ROOT
 from tests.safety import Guard
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_page_is_the_table() -> None:
     written = (ROOT / "docs/stop-reasons.md").read_text(encoding="utf-8")

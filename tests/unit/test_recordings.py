@@ -19,6 +19,8 @@ from hil.log.errors import LogError
 from hil.log.schema import FRAME, Records
 from tests.logfiles import some_ticks, write_log
 
+pytestmark = pytest.mark.slow
+
 T_NS = 1_795_758_784_904_425_000
 STAMP = "(1795758784.904425)"
 EIGHT = bytes(range(0x11, 0x99, 0x11))

@@ -15,6 +15,8 @@ from hil.runtime.setup import Overrides, load_setup
 from hil.signals import INPUTS
 from hil.sim.simulate import simulate
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def logged(tmp_path_factory: pytest.TempPathFactory) -> Path:

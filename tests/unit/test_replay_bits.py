@@ -21,6 +21,8 @@ from tests.conftest import CONFIGS
 from tests.golden.kept import LOGS
 from tests.logfiles import some_ticks
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:

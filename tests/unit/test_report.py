@@ -26,6 +26,8 @@ from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, new_ticks
 from hil.sim.simulate import simulate
 
+pytestmark = pytest.mark.slow
+
 SEED = 20261124
 
 

@@ -7,9 +7,13 @@ import re
 from pathlib import Path
 from typing import Any, get_args
 
+import pytest
+
 from firmware_model.faults import LinkFault, PlantFault
 from hil.config.tables import load_toml
 from hil.faults.matrix import Host, Matrix, Row
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")

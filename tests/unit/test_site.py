@@ -12,6 +12,8 @@ import pytest
 
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 NAV = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:")[1]
 LOADED = re.compile(
     r"""<(?:script|img|iframe)[^>]*\ssrc="(https?:[^"]*)|<link rel="stylesheet" href="(https?:[^"]*)"""

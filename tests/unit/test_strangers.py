@@ -22,6 +22,8 @@ from hil.faults.matrix import Matrix
 from hil.runtime.header import plant_of
 from tests.conftest import CONFIGS, ROOT
 
+pytestmark = pytest.mark.slow
+
 PACKAGES = ("hil", "drivers", "firmware_model")
 RUNS_CODE = {"eval", "exec", "compile", "__import__"}
 LOADS_CODE = {"pickle", "cPickle", "marshal", "shelve", "dill", "joblib", "yaml"}

@@ -28,6 +28,8 @@ from hil.tuning.verify import verdict, verify
 from hil.tuning.windows import figures
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 DEMO = CONFIGS / "demo.toml"
 OLD = (
     'controller={kind="cascade", speed_pole_rad_s=30.0, current_pole_rad_s=250.0}',

@@ -50,5 +50,6 @@ def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str
     """The meter takes some thousand instructions a tick, taken off but for caches and rounding."""
     bus = of_bus(counted, name)
     assert set(bus["phases"]) == set(PHASES)
-    assert min(bus["phases"].values()) > 0, bus["phases"]
+    sleeps = set() if name == "kernel" else {"sleep"}  # there the loop waits for feedback alone
+    assert {phase for phase, count in bus["phases"].items() if count > 0} == set(PHASES) - {"sleep"} | sleeps
     assert sum(bus["phases"].values()) == pytest.approx(total_of(bus), rel=0.2), bus

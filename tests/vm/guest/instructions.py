@@ -19,7 +19,7 @@ from hil import cli
 from hil.bench.meter import run_metered
 from hil.bench.pieces import guard_ns
 from hil.config.tables import RunConfig, load_toml
-from tests.vm.guest.process import CONFIG, FD, SCRATCH, Forked
+from tests.vm.guest.process import CONFIG, FD, KERNEL, SCRATCH, Forked
 
 SECONDS = 0.5
 ATTEMPTS = 3
@@ -28,8 +28,10 @@ BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
     # name: controller's interface, drive's interface, settings, settings of the plant
     "vcan": ("vcan0", "vcan0", (), ()),
     "kvaser": ("can0", "can1", (), ()),
+    "kernel": ("vcan0", "vcan0", KERNEL, ()),
     "fd": ("vcan0", "vcan0", FD, ('dbc="../drives/hil_pmsm_fd.dbc"',)),
 }
+"""kernel: SYNC by the kernel's timer, for the loop and for the bare loop."""
 CALM = ("load=[]", "truth=false")
 
 
@@ -38,15 +40,20 @@ def flags(name: str, *values: str) -> list[str]:
     return [word for value in values for word in (name, value)]
 
 
-def run_bare(interface: str, dbc: Path, ticks: int, priority: int) -> float:
+def run_bare(interface: str, dbc: Path, ticks: int, priority: int, by_kernel: bool) -> float:
     """Instructions a tick of the bare loop."""
-    from drivers.bare import bare_loop, exchange_of, open_raw
+    from drivers.bare import bare_answers, bare_loop, exchange_of, open_raw
+    from drivers.bcm import all_but, kernel_sync
     from drivers.codec import Database
 
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    sockets = open_raw("socketcan", interface)
-    result = bare_loop(sockets, exchange_of(Database(dbc, 1)), 1_000_000, ticks)
-    return result.processor_us * 1e3
+    sockets, database, period_ns = open_raw("socketcan", interface), Database(dbc, 1), 1_000_000
+    frames = exchange_of(database)
+    if not by_kernel:
+        return bare_loop(sockets, frames, period_ns, ticks).processor_us * 1e3
+    can_id = database.message("SYNC").send_id
+    all_but(sockets[0], can_id)
+    return bare_answers(sockets, frames, kernel_sync(interface, can_id, True, period_ns), ticks) * 1e3
 
 
 class Bus:
@@ -92,7 +99,8 @@ class Bus:
         dbc, ticks = Path(CONFIG).parent / config.drive.dbc, round(SECONDS * 1000)
 
         def job() -> int:
-            sys.stdout.write(str(run_bare(self.own, dbc, ticks, config.realtime.fifo_priority)))
+            by_kernel = config.bus.sync == "kernel"
+            sys.stdout.write(str(run_bare(self.own, dbc, ticks, config.realtime.fifo_priority, by_kernel)))
             return 0
 
         return float(self.result(job, "bare"))

@@ -16,6 +16,7 @@ from hil.sim.emulate import make_node
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
 FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
+KERNEL = ('bus.sync="kernel"',)
 
 
 class Forked:

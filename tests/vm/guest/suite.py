@@ -20,7 +20,7 @@ from pathlib import Path
 
 from tests.vm.guest import IN_MACHINE
 from tests.vm.guest import instructions as counted
-from tests.vm.guest.process import CONFIG, FD, SCRATCH, Forked, warm_up
+from tests.vm.guest.process import CONFIG, FD, KERNEL, SCRATCH, Forked, warm_up
 
 OUT = Path(os.environ["OUT"])
 
@@ -93,9 +93,6 @@ def vcan_5_khz() -> None:
     settings = ("loop.rate_hz=5000", "loop.feedback_timeout_us=160")
     with Scenario("vcan_5_khz", seconds=0.6, settings=settings) as s:
         s.start()
-
-
-KERNEL = ('bus.sync="kernel"',)
 
 
 def vcan_kernel_sync() -> None:
