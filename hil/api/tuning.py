@@ -15,7 +15,8 @@ from hil.errors import HilError
 from hil.faults.matrix import inline
 from hil.tuning import compare as comparing
 from hil.tuning import design as designing
-from hil.tuning.families import DEFAULT_LAWS, settings_of
+from hil.tuning.bench import speed_drive, takes_voltage
+from hil.tuning.families import settings_of
 
 SPREAD = ("J", "psi_f", "R_s", "L")
 
@@ -32,8 +33,9 @@ def design(
 ) -> dict[str, Any]:
     """Windows and poles for a motor and a wish, as ``hil design``; takes seconds to minutes on all cores.
 
-    ``wish``: ``u_noise_mv``, ``ms``, ``ms_worst``, ``dip`` [rad/s], ``recovery_ms``, ``laws``, ``effort`` and
-    those of a shaft. ``load`` [N m], ``w_noise`` [rad/s], ``i_noise`` [A] default to those of the plant.
+    ``wish``: ``u_noise_mv`` (of a drive with its own current loop ``command_noise`` [A or N m]), ``ms``,
+    ``ms_worst``, ``dip`` [rad/s], ``recovery_ms``, ``laws``, ``effort`` and those of a shaft.
+    ``load`` [N m], ``w_noise`` [rad/s], ``i_noise`` [A] default to those of the plant.
     Of the result: ``settings`` for ``hil.load``, the same as ``toml``, ``front``, what it will do.
     Raises ``hil.HilError`` when no design keeps the limits.
     """
@@ -45,14 +47,15 @@ def design(
 
 
 def compare(
-    config: File, laws: Sequence[str] = DEFAULT_LAWS, settings: Settings = (), **wish: Any
+    config: File, laws: Sequence[str] | None = None, settings: Settings = (), **wish: Any
 ) -> dict[str, Any]:
     """Laws, each tuned by one optimiser to the same limits and run on the same plants, as ``hil compare``.
 
-    ``wish``: ``u_noise_mv``, ``ms``, ``ms_worst``, ``spread``, ``seeds``, ``effort``. Raises
-    ``hil.HilError``.
+    ``wish``: ``u_noise_mv`` or ``command_noise``, ``ms``, ``ms_worst``, ``spread``, ``seeds``, ``effort``;
+    without ``laws`` all but the special ones. Raises ``hil.HilError``.
     """
-    families = comparing.parse_laws(",".join(laws))
+    own = not takes_voltage(speed_drive(Path(config), overrides(settings)))
+    families = comparing.parse_laws(",".join(comparing.default_laws(own) if laws is None else laws), own)
     asked = comparing.Wish(**_known(wish, comparing.Wish))
     return comparing.compare(Path(config), overrides(settings), families, asked)
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, one_thread, overrides, print_json, say
-from hil.commands.tuning import _above_one, _not_negative, _positive
+from hil.commands.tuning import _above_one, _not_negative, _positive, noise_flags
 from hil.log.outputs import output_file
 
 
@@ -21,7 +21,7 @@ def register(commands: Commands) -> None:
     command.add_argument(
         "--settle-ms", type=_positive, metavar="MS", help="back in 0.5 rad/s; noise is made least"
     )
-    command.add_argument("--u-noise-mv", type=_positive, metavar="MV", help="noise in u_q, rms")
+    noise_flags(command)
     command.add_argument(
         "--ms", type=_above_one, default=1.6, metavar="MS", help="peak of the sensitivity (1.6)"
     )
@@ -65,6 +65,7 @@ def cmd_tune(args: argparse.Namespace) -> int:
         args.settle_ms,
         laws=("ftdob",),
         effort=args.effort,
+        command_noise=args.command_noise,
     )
     given = at_motor(overrides(args), args.motor)
     with progress("cases", args.cases) as seen:

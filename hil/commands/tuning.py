@@ -38,7 +38,7 @@ def register(commands: Commands) -> None:
     bus_flags(command)
     command = commands.add("design", cmd_design, "Find windows and poles for a motor, its noise and a wish.")
     command.add_argument("config", type=Path, metavar="CONFIG", help="run configuration: motor, rate, frames")
-    _limits(command, "100 mV, 1.6, 2.2")
+    _limits(command, "100 mV or 1 %% of the largest command, 1.6, 2.2")
     command.add_argument("--dip", type=_positive, metavar="RAD_S", help="largest dip; noise is made least")
     command.add_argument(
         "--settle-ms", type=_positive, metavar="MS", help="back in 0.5 rad/s; noise is made least"
@@ -72,9 +72,21 @@ def register(commands: Commands) -> None:
 
 def _limits(command: argparse.ArgumentParser, default: str) -> None:
     group = command.add_argument_group(f"limits (default: {default})")
-    group.add_argument("--u-noise-mv", type=_positive, metavar="MV", help="noise in u_q, rms")
+    noise_flags(group)
     group.add_argument("--ms", type=_above_one, metavar="MS", help="peak of the sensitivity")
     group.add_argument("--ms-worst", type=_above_one, metavar="MS", help="the same in the worst corner")
+
+
+def noise_flags(group: Any) -> None:
+    """The two wishes for noise, of which a drive has one."""
+    pair = group.add_mutually_exclusive_group()
+    pair.add_argument("--u-noise-mv", type=_positive, metavar="MV", help="noise in u_q, rms")
+    pair.add_argument(
+        "--command-noise",
+        type=_positive,
+        metavar="X",
+        help="noise in the command, rms, in A or N m, of a drive with its own current loop",
+    )
 
 
 def _number(text: str, low: float, high: float, what: str, *, closed: bool = False) -> float:
@@ -141,14 +153,17 @@ def cmd_compare(args: argparse.Namespace) -> int:
     """Compare laws."""
     one_thread()
     from hil.report.view import progress, show
-    from hil.tuning.compare import Wish, compare, parse_laws
-    from hil.tuning.families import DEFAULT_LAWS
+    from hil.tuning.bench import speed_drive, takes_voltage
+    from hil.tuning.compare import Wish, compare, default_laws, parse_laws
     from hil.tuning.page import comparison
     from hil.tuning.tables import comparison_table
 
-    families = parse_laws(",".join(DEFAULT_LAWS) if args.laws is None else args.laws)
+    own = not takes_voltage(speed_drive(args.config, overrides(args)))
+    families = parse_laws(",".join(default_laws(own)) if args.laws is None else args.laws, own)
     out = output_folder(args.output, "compare.html")
-    wish = Wish(args.u_noise_mv, args.ms, args.ms_worst, args.spread, args.seeds, args.effort)
+    wish = Wish(
+        args.u_noise_mv, args.ms, args.ms_worst, args.spread, args.seeds, args.effort, args.command_noise
+    )
     with progress(f"tune {len(families)} laws", len(families)) as seen:
         found = compare(args.config, overrides(args), families, wish, seen)
     page = out / "compare.html"
@@ -184,7 +199,7 @@ def cmd_design(args: argparse.Namespace) -> int:
     ms, ms_worst = args.ms or 1.6, args.ms_worst or max(2.2, args.ms or 0.0)
     wish = Wish(
         args.u_noise_mv, ms, ms_worst, args.dip, args.settle_ms, args.shaft, args.shaft_damping,
-        args.shaft_share, laws, args.effort,
+        args.shaft_share, laws, args.effort, args.command_noise,
     )  # fmt: skip
     given = {"load": args.load, "w_noise": args.w_noise, "i_noise": args.i_noise}
     start = time.perf_counter()
@@ -204,13 +219,13 @@ def cmd_design(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any]) -> dict[str, Any]:
-    from hil.config.design import law_spec
     from hil.report.view import progress
-    from hil.tuning.bench import speed_drive
+    from hil.tuning.bench import bench_of, spec_in, speed_drive
     from hil.tuning.optimise import law_of
     from hil.tuning.verify import verify
 
     setup, spread = speed_drive(args.config, overrides(args)), _spread(args.spread)
-    law = law_of(best.tables, law_spec(setup.config), 1.0 / setup.config.loop.rate_hz)
-    with progress("verify on 18 plants", 18) as seen:
+    law = law_of(best.tables, spec_in(setup), 1.0 / setup.config.loop.rate_hz)
+    plants = 1 + len(bench_of(args.config, setup, spread=spread).plants())
+    with progress(f"verify on {plants} plants", plants) as seen:
         return verify(args.config, overrides(args), best.tables, given, spread, law, seen)

@@ -72,9 +72,11 @@ def tune(
     setup = speed_drive(path, overrides)
     motor = setup.config.motor
     known = motor.identified
-    if known is not None and known.delay_ticks not in (None, 1):
+    acts_after = 1 + setup.config.drive.delay_ticks
+    if known is not None and known.delay_ticks not in (None, acts_after):
         raise HilError(
-            f"{path}: the bus delays by {known.delay_ticks} ticks; the laws predict one: a lower loop.rate_hz"
+            f"{path}: the bus delays by {known.delay_ticks} ticks; the laws predict {acts_after}: a lower "
+            "loop.rate_hz, or drive.delay_ticks of a drive with its own current loop"
         )
     spread, given = spread_of(motor), {"load": load, **noise_of(setup)}
     found, best = design(path, overrides, wish, given, spread)
@@ -85,7 +87,9 @@ def tune(
         "spread": spread,
         "tables": best.tables,
         "predicted": {
-            key: found[key] for key in ("iae", "u_noise_mv", "ms", "ms_worst", "worst_recovery_ms")
+            key: found[key]
+            for key in ("iae", "u_noise_mv", "command_noise", "ms", "ms_worst", "worst_recovery_ms")
+            if key in found
         },
         "margins": found["margins"],
         "limited_by": found["limited_by"],
@@ -102,7 +106,7 @@ def tune(
 def limits_in_words(names: list[str], config: RunConfig) -> str:
     """What keeps the design from being better."""
     said = {
-        "u_noise": "noise in u_q",
+        "u_noise": "noise in u_q" if config.drive.takes == "voltage" else "noise in the command",
         "ms": "margin (Ms)",
         "ms_worst": "margin in the worst corner of the intervals",
         "dip": "the dip that is wished for",
@@ -120,7 +124,7 @@ def tuned_data(path: Path, overrides: Overrides, motor: MotorTable, tables: dict
         override(data, text, path.parent)
     data["motor"] = motor.model_dump(exclude_none=True)
     data["controller"] = tables["controller"]
-    data["observer"] = {"speed": tables["speed"], "current": tables["current"]}
+    data["observer"] = {name: table for name, table in tables.items() if name != "controller"}
     validate(data, RunConfig, str(path), path.parent)
     return data
 

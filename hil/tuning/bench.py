@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.config.design import motor_model
-from hil.control.law import CASCADE, FAC, MTPA, PI
+from hil.config.design import law_spec, motor_model, speed_filter
+from hil.control.law import CASCADE, FAC, MTPA, PI, SPEED, LawSpec
 from hil.errors import HilError
 from hil.report.metrics import RECOVERED_RAD_S, find_step, operating
 from hil.runtime.setup import Overrides, Setup, load_setup
@@ -19,28 +19,37 @@ from hil.sim.emulate import load_plant
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.measure import Bench
 
+UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
+"""Spread where none is given."""
 QUIET_S: Final = 0.5
-"""Time before the load step in which the noise of u_q is measured."""
+"""Time before the load step in which the noise of the command is measured."""
 
 
 def speed_drive(path: Path, overrides: Overrides) -> Setup:
-    """The setup of a drive under speed control by voltages. Raises HilError for any other law."""
+    """The setup of a drive under speed control. Raises HilError for any other law."""
     setup = load_setup(path, overrides)
-    kind = int(setup.machine.law["kind"][0])
-    if kind == FAC:
+    code, kind = int(setup.machine.law["kind"][0]), setup.config.controller.kind
+    if code == FAC:
         raise HilError(f"{path}: controller.kind fac commands the load; only speed drives can be tuned")
-    if setup.config.controller.kind == "torque":
+    if kind == "torque":
         raise HilError(f"{path}: controller.kind torque follows no speed; only speed drives can be tuned")
-    if kind not in (CASCADE, PI):
-        if kind == MTPA:
-            raise HilError(
-                f"{path}: controller.kind mtpa: tune it as cascade, whose poles it has, and put them in"
-            )
+    if code == MTPA:
         raise HilError(
-            f"{path}: controller.kind {setup.config.controller.kind} asks for no voltage; only laws that do "
-            "can be tuned; the margins of this one: hil check"
+            f"{path}: controller.kind mtpa: tune it as cascade, whose poles it has, and put them in"
         )
+    if code not in (CASCADE, PI, SPEED) or setup.machine.law["rows"][0]:
+        raise HilError(f"{path}: controller.kind {kind} is no speed control; only that can be tuned")
     return setup
+
+
+def spec_in(setup: Setup) -> LawSpec:
+    """The law's tuning as the run has it: with what the drive reports. Raises ControlDesignError."""
+    return law_spec(setup.config, bool(setup.machine.law["told"][0]))
+
+
+def takes_voltage(setup: Setup) -> bool:
+    """False for a drive with a current loop of its own."""
+    return setup.config.drive.takes == "voltage"
 
 
 def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = None, **more: Any) -> Bench:
@@ -52,9 +61,10 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
     if setup.config.emulator is not None:
         plant, _ = load_plant(path, setup.config)
         sensors = plant.sensors.w_noise_rad_s, plant.sensors.i_noise_a
-        steps = [abs(one.torque_n_m) for one in plant.load if one.kind == "step"]
+        steps = [abs(one.torque_n_m) for one in plant.load if one.kind in ("step", "brake")]
         load, u_lsb = max(steps, default=None), plant.inverter.resolution_v
     own = {name: value for name, value in (given or {}).items() if value is not None}
+    more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
     motor, lsb = motor_model(setup.config.motor), setup.wire.x_lsb
     load = own.get("load", load)
     if load is None:
@@ -65,11 +75,25 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         load,
         math.hypot(own.get("w_noise", sensors[0]), lsb[0] / math.sqrt(12)),
         math.hypot(own.get("i_noise", sensors[1]), lsb[1] / math.sqrt(12)),
-        max(u_lsb, setup.wire.u_lsb) / math.sqrt(12),
+        max(u_lsb, setup.wire.u_lsb) / math.sqrt(12) if takes_voltage(setup) else 0.0,
         _speed(setup),
         i_d_noise=math.hypot(own.get("i_noise", sensors[1]), lsb[2] / math.sqrt(12)),
         **more,
     )
+
+
+def _own_loop(setup: Setup, spread: dict[str, float]) -> dict[str, Any]:
+    """What a drive's own current loop adds to the bench; R_s and L stay behind it.
+
+    The observer knows how a command was rounded: that is no noise to it.
+    """
+    config = setup.config
+    return {
+        "inner": spec_in(setup).inner,
+        "filter": speed_filter(config.drive.speed_filter, config.loop.rate_hz),
+        "unit": config.command.unit,
+        "spread": {name: spread.get(name, 0.0) for name in ("J", "psi_f")},
+    }
 
 
 def _speed(setup: Setup) -> float:
@@ -82,7 +106,10 @@ def _speed(setup: Setup) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A load step in a simulated run: dip [rad/s], recovery [ms], IAE [rad]; noise of u_q before it [V]."""
+    """A load step in a simulated run: dip [rad/s], recovery [ms], IAE [rad]; the command's noise before it.
+
+    That is of u_q [V], or of the current or torque that is asked for [A, N m].
+    """
 
     dip: float
     recovery_ms: float

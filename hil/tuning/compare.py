@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from hil.config.design import law_spec
 from hil.errors import HilError
 from hil.runtime.setup import Overrides
 from hil.sim.emulate import load_plant
-from hil.tuning.bench import bench_of, corner_settings, simulated, speed_drive
-from hil.tuning.families import Family, family, settings_of, toml
-from hil.tuning.measure import Bench, judge
+from hil.tuning.bench import bench_of, corner_settings, simulated, spec_in, speed_drive
+from hil.tuning.design import noise_wished
+from hil.tuning.families import DEFAULT_LAWS, OWN_LOOP, Family, family, settings_of, toml
+from hil.tuning.measure import Bench, judge, noise_in
 from hil.tuning.optimise import Limits, Tuned, tune
 
 AS_CONFIGURED = "as-configured"
@@ -39,29 +39,33 @@ class Wish:
     spread: float = 0.3
     seeds: int = 3
     effort: float = 1.5
+    command_noise: float | None = None
 
 
-def parse_laws(text: str) -> list[Family]:
+def default_laws(own_loop: bool) -> list[str]:
+    """What is compared when nothing is named."""
+    return [name for name in DEFAULT_LAWS if not own_loop or name in OWN_LOOP]
+
+
+def parse_laws(text: str, own_loop: bool = False) -> list[Family]:
     """The families of ``a,b,c``. Raises HilError for an unknown one, a repeated one and none."""
     names = [name.strip() for name in text.split(",") if name.strip()]
-    found = [family(name) for name in names]
+    found = [family(name, own_loop) for name in names]
     if not found or len({one.law for one in found}) != len(found):
         raise HilError(f"--laws: {text!r} names no law, or one twice")
     return found
 
 
-def limits_of(wish: Wish, own: Any) -> Limits:
-    """The limits for every law; what the wish leaves open is what the configuration itself reaches."""
+def limits_of(wish: Wish, own: Any, given: float | None) -> Limits:
+    """The limits for every law, ``given`` that of noise; the configuration itself tells what is left open."""
 
     def or_own(given: float | None, value: float, name: str) -> float:
         if given is None and not math.isfinite(value):
             raise HilError(f"the configuration itself is unstable in a corner: give --{name}")
         return value if given is None else given
 
-    u_mv = or_own(wish.u_noise_mv, own.u_noise * 1e3, "u-noise-mv")
-    return Limits(
-        u_mv * 1e-3, or_own(wish.ms, own.nominal.ms, "ms"), or_own(wish.ms_worst, own.worst.ms, "ms-worst")
-    )
+    ms, ms_worst = or_own(wish.ms, own.nominal.ms, "ms"), or_own(wish.ms_worst, own.worst.ms, "ms-worst")
+    return Limits(own.u_noise if given is None else given, ms, ms_worst)
 
 
 def run_row(path: Path, overrides: Overrides, bench: Bench, seeds: Sequence[int]) -> dict[str, Any]:
@@ -73,7 +77,7 @@ def run_row(path: Path, overrides: Overrides, bench: Bench, seeds: Sequence[int]
     }
     return {
         **mean,
-        "u_noise_mv": float(np.mean([run.u_noise for run in runs])) * 1e3,
+        **noise_in(bench.unit, float(np.mean([run.u_noise for run in runs]))),
         "worst_dip": max((run.dip for run in corners), default=mean["dip"]),
         "worst_recovery_ms": max((run.recovery_ms for run in corners), default=mean["recovery_ms"]),
         "dips": [run.dip for run in runs],
@@ -88,14 +92,14 @@ def _tuned_row(
 ) -> dict[str, Any]:
     """Tune a law and run it."""
     setup = speed_drive(path, overrides)
-    found = tune(one, bench, limits, law_spec(setup.config), effort=wish.effort)
+    found = tune(one, bench, limits, spec_in(setup), effort=wish.effort)
     settings = settings_of(found.tables)
     seen = run_row(path, replace(overrides, settings=(*overrides.settings, *settings)), bench, seeds)
-    return _row(one.law, one.doc, found, seen)
+    return _row(one.law, one.doc, found, seen, bench.unit)
 
 
-def _row(law: str, doc: str, found: Tuned, seen: dict[str, Any]) -> dict[str, Any]:
-    linear = found.verdict.as_dict()
+def _row(law: str, doc: str, found: Tuned, seen: dict[str, Any], unit: str) -> dict[str, Any]:
+    linear = found.verdict.as_dict(unit)
     return {
         "law": law,
         "what": doc,
@@ -123,13 +127,13 @@ def compare(
     plant, _ = load_plant(path, setup.config)
     seeds = [plant.seed + j for j in range(wish.seeds)]
     own = judge(setup.machine.law, bench)
-    limits = limits_of(wish, own)
+    limits = limits_of(wish, own, noise_wished(setup, wish.u_noise_mv, wish.command_noise))
     itself = {
         "law": AS_CONFIGURED,
         "what": "the configuration as it is",
         **run_row(path, overrides, bench, seeds),
     }
-    itself |= {"ms": own.nominal.ms, "ms_worst": own.worst.ms, "linear": own.as_dict()}
+    itself |= {"ms": own.nominal.ms, "ms_worst": own.worst.ms, "linear": own.as_dict(bench.unit)}
     rows = []
     with ProcessPoolExecutor() as pool:
         jobs = [pool.submit(_tuned_row, path, overrides, f, bench, limits, wish, seeds) for f in families]
@@ -139,7 +143,7 @@ def compare(
                 seen(len(rows))
     return {
         "config": str(path),
-        "limits": {"u_noise_mv": limits.u_noise * 1e3, "ms": limits.ms, "ms_worst": limits.ms_worst},
+        "limits": {**noise_in(bench.unit, limits.u_noise), "ms": limits.ms, "ms_worst": limits.ms_worst},
         "bench": asdict(bench),
         "seeds": seeds,
         "as_configured": itself,

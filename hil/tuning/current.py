@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.linalg import expm
 
 from hil.control.jit import jit
 from hil.control.law import MotorModel, ask, between, new_law_state, observe, reset
@@ -21,8 +20,8 @@ from hil.control.linalg import Array
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speed import COMMANDS, flowed, latched
 from hil.control.speedfilter import MOST_AVERAGE
-from hil.tuning.loop import LOAD, NO_LIMIT, PULSE_W, Record
-from hil.tuning.measure import Margins, margins_of, peak_of
+from hil.tuning.loop import LOAD, NO_LIMIT, PULSE_I, PULSE_U, PULSE_W, Plant, Record, one_mass, sampled
+from hil.tuning.sensitivity import Margins, margins_of, peak_of
 
 RESPONSE_S: Final = 1.0
 """Length of the responses; a loop that has not come to rest by then counts as unstable."""
@@ -32,53 +31,56 @@ RESTLESS: Final = 0.02
 """Share of a response's peak that may be left in its last tenth."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shaft:
-    """x+ = A x + b u + e d, y = C x with x = (w, i, ...); A (n, n), b, e and C (n,)."""
+def shaft_of(
+    motor: MotorModel,
+    inner: InnerLoop,
+    given: SpeedFilter | None,
+    T_s: float,
+    masses: tuple[Array, Array] | None = None,
+) -> Plant:
+    """The plant behind a current loop, exact for u and T_L held over a tick; x = (w, i, ..., filter).
 
-    A: Array
-    b: Array
-    e: Array
-    C: Array
-
-
-def shaft_of(motor: MotorModel, inner: InnerLoop, given: SpeedFilter | None, T_s: float) -> Shaft:
-    """Exact for u and d held over a tick; ``given`` filters the speed, whatever the observer knows of it."""
+    ``given`` filters the speed, whatever the observer knows of it; ``masses``: one inertia, or
+    :func:`hil.tuning.loop.two_masses`.
+    """
     given = given or SpeedFilter()
-    f = 2 if given.ticks else len(given.poles)
-    whole = np.zeros((f + 4, f + 4))  # (w, i, filter), u, d
-    whole[0, 0], whole[0, 1], whole[0, -1] = -motor.B_f / motor.J, inner.k_u / motor.J, 1.0
+    own, load = masses or one_mass(motor)
+    n, f = len(own), 2 if len(given.poles) == 2 else int(bool(given.poles or given.ticks))
+    A, B = np.zeros((n + f, n + f)), np.zeros((n + f, 2))
+    A[:n, :n], B[:n, 1] = own, load
     lag = inner.lag or 1e-4 * T_s
-    whole[1, 1], whole[1, -2] = -1.0 / lag, 1.0 / lag
-    C = np.eye(f + 2)[2 if f else 0]
+    A[0, 1] *= inner.k_u / motor.k_t
+    A[1], B[1, 0] = 0.0, 1.0 / lag
+    A[1, 1] = -1.0 / lag
     if given.ticks:
-        whole[2, 0], f = 1.0, 1
+        A[n, 0] = 1.0
     elif f == 1:
-        whole[2, 0], whole[2, 2] = given.poles[0], -given.poles[0]
+        A[n, 0], A[n, n] = given.poles[0], -given.poles[0]
     elif f == 2:
         p, q = given.poles
-        whole[2, 3], whole[3, 0], whole[3, 2], whole[3, 3] = 1.0, p * q, -p * q, -p - q
-    step, n = expm(whole * T_s), f + 2
-    shaft = Shaft(step[:n, :n], step[:n, -2], step[:n, -1], C[:n])
-    return _mean(shaft, given.ticks, T_s) if given.ticks else shaft
+        A[n, n + 1], A[n + 1, 0], A[n + 1, n], A[n + 1, n + 1] = 1.0, p * q, -p * q, -p - q
+    shaft = sampled(A, B, T_s, np.eye(n + f)[n if f else 0])
+    return _mean(shaft, n, given.ticks, T_s) if given.ticks else shaft
 
 
-def _mean(shaft: Shaft, ticks: int, T_s: float) -> Shaft:
-    """(w, i, angle of the last tick, of the one before, ...)."""
-    n = 2 + ticks
+def _mean(shaft: Plant, first: int, ticks: int, T_s: float) -> Plant:
+    """(w, i, ..., angle of the last tick, of the one before, ...)."""
+    n = first + ticks
     A, C = np.zeros((n, n)), np.zeros(n)
-    A[:3, :2], C[2:] = shaft.A[:, :2], 1.0 / (ticks * T_s)
-    for row in range(3, n):
+    A[: first + 1, :first], C[first:] = shaft.A[:, :first], 1.0 / (ticks * T_s)
+    for row in range(first + 1, n):
         A[row, row - 1] = 1.0
     b, e = (np.r_[part, np.zeros(ticks - 1)] for part in (shaft.b, shaft.e))
-    return Shaft(A, b, e, C)
+    return Plant(A, b, e, C)
 
 
 @jit
-def respond_current(p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind: int, out: Array) -> None:
-    """The loop's response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on.
+def respond_current(
+    p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind: int, closed: bool, out: Array
+) -> None:
+    """The response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on.
 
-    It begins with a measurement.
+    It begins with a measurement. Not ``closed``, the observer alone: no command reaches the drive.
     """
     n, K, every = A.shape[0], out.shape[1], max(p["every"], 1)
     x, new, way = np.zeros(n), np.zeros(n), np.zeros(COMMANDS)
@@ -89,19 +91,20 @@ def respond_current(p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind
         y = 1.0 if kind == PULSE_W and k == 0 else 0.0
         for c in range(n):
             y += C[c] * x[c]
-        s["ua"][0] = flowed(p, s, x[1], fresh and p["told"] != 0, 1)
+        i = x[1] + (1.0 if kind == PULSE_I and k == 0 else 0.0)
+        s["ua"][0] = flowed(p, s, i, fresh and p["told"] != 0, 1)
         observe(p, s, y, 0.0, 0.0, fresh, 1)
         if not fresh:
             between(p, s)
         latched(p, s, way[0], True)
         ask(p, s, 0.0, 0.0, 0.0, NO_LIMIT)
-        acts = way[p["delay"]]
+        acts = way[p["delay"]] + (1.0 if kind == PULSE_U and k == 0 else 0.0)
         load = 1.0 if kind == LOAD and k >= 0 else 0.0
         if k >= 0:
             out[0, k], out[1, k], out[2, k], out[3, k] = s["u"][1], y, x[0], s["d_hat"][0]
         for age in range(p["delay"], 0, -1):
             way[age] = way[age - 1]
-        way[0] = s["u"][1]
+        way[0] = s["u"][1] if closed else 0.0
         for r in range(n):
             total = b[r] * acts + e[r] * load
             for c in range(n):
@@ -109,6 +112,16 @@ def respond_current(p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kind
             new[r] = total
         for r in range(n):
             x[r] = new[r]
+
+
+@jit
+def respond_each(
+    p: Any, s: Any, A: Array, b: Array, e: Array, C: Array, kinds: Any, closed: bool, out: Array
+) -> None:
+    """:func:`respond_current` for every plant and kind; A (m, n, n), out (m, kinds, 4, K)."""
+    for m in range(A.shape[0]):
+        for j in range(kinds.shape[0]):
+            respond_current(p, s, A[m], b[m], e[m], C[m], kinds[j], closed, out[m, j])
 
 
 NONE: Final = Margins(0.0, 0.0, 0.0)
@@ -126,7 +139,7 @@ class Loop:
     u_noise: float = math.inf
 
 
-def loop_of(law: Record, shaft: Shaft, T_s: float) -> Loop:
+def loop_of(law: Record, shaft: Plant, T_s: float) -> Loop:
     """Run a law through a shaft's filter and judge it."""
     own, state = law.copy(), new_law_state()
     own["cogs"] = 0  # known over the angle: no part of the linear loop
@@ -134,7 +147,7 @@ def loop_of(law: Record, shaft: Shaft, T_s: float) -> Loop:
     step, pulse = np.empty((2, 4, min(max(round(RESPONSE_S / T_s), 500), 20_000)))
     with np.errstate(over="ignore", invalid="ignore"):
         for kind, out in ((LOAD, step), (PULSE_W, pulse)):
-            respond_current(own[0], state[0], shaft.A, shaft.b, shaft.e, shaft.C, kind, out)
+            respond_current(own[0], state[0], shaft.A, shaft.b, shaft.e, shaft.C, kind, True, out)
     if not all(_at_rest(row) for row in (step[2], pulse[0], pulse[1])):
         return Loop(False)
     u, seen, _, d = pulse

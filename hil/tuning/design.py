@@ -1,8 +1,9 @@
 """`hil design`: from motor, rate, noise, spread and a wish to windows and poles, with what they will do.
 
-The wish is a set of limits: noise in u_q, Ms, dip, recovery. With a dip or a recovery wished for, noise is
-made least; else the worst corner's IAE is. The front is the same design at other budgets of noise. A soft
-shaft makes the design slower until it is stable on it, or it is refused.
+The wish is a set of limits: noise in the command, Ms, dip, recovery. With a dip or a recovery wished for,
+noise is made least; else the worst corner's IAE is. The front is the same design at other budgets of
+noise. A soft shaft makes the design slower until it is stable on it, or it is refused. A drive with a current
+loop of its own is commanded in A or N m; its loop and the filter of its speed are part of the plant.
 """
 
 from __future__ import annotations
@@ -16,21 +17,22 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.config.design import law_spec
 from hil.control.law import LawSpec
 from hil.errors import HilError
-from hil.runtime.setup import Overrides
-from hil.tuning.bench import bench_of, speed_drive
+from hil.runtime.setup import Overrides, Setup
+from hil.tuning.bench import bench_of, spec_in, speed_drive, takes_voltage
 from hil.tuning.families import Family, family, toml
-from hil.tuning.loop import rigid, shaft
-from hil.tuning.measure import Bench, margins, quiet
+from hil.tuning.measure import Bench, margins, noise_text, quiet
 from hil.tuning.optimise import Limits, Tuned, law_of, spec_of, tune
-from hil.tuning.windows import figures
+from hil.tuning.windows import figures, own_loop_figures
 
 WINDOWS: Final = ("ftdob", "least-noise", "cubic")
 """What is tried when no law is named."""
 BUDGETS: Final = (0.25, 0.5, 2.0, 4.0)
-"""Noise in u_q of the front's other points, times that of the design."""
+"""Noise in the command of the front's other points, times that of the design."""
+NOISE_MV: Final = 100.0
+NOISE_SHARE: Final = 0.01
+"""Noise of a command that nothing else bounds: of a voltage, and of what an own loop's command may be."""
 CHECKED_HZ: Final = 24
 SEARCHED_HZ: Final = 8
 CHECK_S: Final = 4.0
@@ -38,7 +40,10 @@ CHECK_S: Final = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What is wished for; ``shaft_hz`` is one resonance or a range (low, high)."""
+    """What is wished for; ``shaft_hz`` is one resonance or a range (low, high).
+
+    ``command_noise`` [A or N m] is of a drive with its own current loop what ``u_noise_mv`` is of voltages.
+    """
 
     u_noise_mv: float | None = None
     ms: float = 1.6
@@ -50,19 +55,21 @@ class Wish:
     shaft_share: float = 0.5
     laws: tuple[str, ...] = WINDOWS
     effort: float = 0.5
+    command_noise: float | None = None
 
     @property
     def aims_at_noise(self) -> bool:
         """Whether noise is to be least, not IAE."""
         return self.dip is not None or self.recovery_ms is not None
 
-    def limits(self, share: float = 1.0) -> Limits:
-        """Of the search; 100 mV where nothing else bounds the noise."""
-        u_mv = self.u_noise_mv
-        if u_mv is None:
-            u_mv = math.inf if self.aims_at_noise else 100.0
+    def limits(self, setup: Setup) -> Limits:
+        """Of the search; NOISE_MV or NOISE_SHARE where nothing else bounds the noise. Raises HilError."""
+        noise = noise_wished(setup, self.u_noise_mv, self.command_noise)
+        if noise is None:
+            own = NOISE_MV * 1e-3 if takes_voltage(setup) else NOISE_SHARE * setup.config.command.most
+            noise = math.inf if self.aims_at_noise else own
         dip, recovery = (math.inf if wish is None else wish for wish in (self.dip, self.recovery_ms))
-        return Limits(u_mv * 1e-3 * share, self.ms, self.ms_worst, dip, recovery)
+        return Limits(noise, self.ms, self.ms_worst, dip, recovery)
 
     def shafts(self, count: int) -> tuple[tuple[float, float, float], ...]:
         """The resonances to look at."""
@@ -73,21 +80,33 @@ class Wish:
         return tuple((f, self.shaft_damping, self.shaft_share) for f in hz)
 
 
+def noise_wished(setup: Setup, u_noise_mv: float | None, command_noise: float | None) -> float | None:
+    """The noise that is wished for [V, A, N m]. Raises HilError for one in the unit of another drive."""
+    voltage, command = takes_voltage(setup), setup.config.command
+    if voltage and command_noise is not None:
+        raise HilError("--command-noise: this drive takes voltages; give --u-noise-mv in mV")
+    if not voltage and u_noise_mv is not None:
+        raise HilError(
+            f"--u-noise-mv: this drive takes a {command.takes}; give --command-noise in {command.unit}"
+        )
+    return command_noise if u_noise_mv is None else u_noise_mv * 1e-3
+
+
 def _tune(
     one: Family, bench: Bench, limits: Limits, base: LawSpec, effort: float, aim: Any, start: Any
 ) -> Tuned:
     return tune(one, bench, limits, base, effort=effort, aim=aim, start=start)
 
 
-def _best(found: Sequence[Tuned], noise: bool) -> Tuned:
+def _best(found: Sequence[Tuned], noise: bool, unit: str) -> Tuned:
     """The best that keeps all limits. Raises HilError when none does."""
     kept = [one for one in found if one.feasible]
     if not kept:
-        raise HilError(f"no design keeps these limits; {_why(found)}")
+        raise HilError(f"no design keeps these limits; {_why(found, unit)}")
     return min(kept, key=lambda one: one.verdict.u_noise if noise else one.verdict.worst.iae)
 
 
-def _why(found: Sequence[Tuned]) -> str:
+def _why(found: Sequence[Tuned], unit: str) -> str:
     """How near the nearest came."""
     if not any(one.verdict.worst.stable for one in found):
         return (
@@ -96,8 +115,8 @@ def _why(found: Sequence[Tuned]) -> str:
     near = min(found, key=lambda one: one.verdict.worst.ms)
     v = near.verdict
     return (
-        f"{near.family.law} came to {v.u_noise * 1e3:.1f} mV, Ms {v.nominal.ms:.2f}/{v.worst.ms:.2f}, dip "
-        f"{v.nominal.dip:.2f} rad/s, back in {v.nominal.recovery_ms:.0f} ms: loosen one of them"
+        f"{near.family.law} came to {noise_text(v.u_noise, unit)}, Ms {v.nominal.ms:.2f}/{v.worst.ms:.2f}, "
+        f"dip {v.nominal.dip:.2f} rad/s, back in {v.nominal.recovery_ms:.0f} ms: loosen one of them"
     )
 
 
@@ -106,15 +125,16 @@ def design(
 ) -> tuple[dict[str, Any], Tuned]:
     """Find the design and its front. Raises HilError when none keeps the limits."""
     setup = speed_drive(path, overrides)
-    base = law_spec(setup.config)
+    base, own = spec_in(setup), not takes_voltage(setup)
     bench = bench_of(path, setup, given, spread=spread, shafts=wish.shafts(SEARCHED_HZ))
     aim = "noise" if wish.aims_at_noise else "iae"
-    limits, families = wish.limits(), [family(name) for name in wish.laws]
+    limits, families = wish.limits(setup), [family(name, own) for name in wish.laws]
     with ProcessPoolExecutor() as pool:
         jobs = [pool.submit(_tune, f, bench, limits, base, wish.effort, aim, None) for f in families]
-        best = _best([job.result() for job in jobs], wish.aims_at_noise)
+        best = _best([job.result() for job in jobs], wish.aims_at_noise, bench.unit)
         _check_shafts(best, bench, base, wish)
-        at = best.verdict.u_noise if wish.aims_at_noise else limits.u_noise
+        free = wish.aims_at_noise or "u_noise" not in best.limits_it
+        at = best.verdict.u_noise if free else limits.u_noise
         budgets = [
             replace(limits, u_noise=at * share, dip=math.inf, recovery_ms=math.inf) for share in BUDGETS
         ]
@@ -129,13 +149,14 @@ def design(
 def _check_shafts(best: Tuned, bench: Bench, base: LawSpec, wish: Wish) -> None:
     """Refuse what is unstable on the shaft, on a finer grid and for longer than the search looked."""
     fine = wish.shafts(CHECKED_HZ)
-    plants = [shaft(bench.motor, bench.T_s, *one) for one in fine]
+    plants = [bench.plant(bench.motor, one) for one in fine]
     law = law_of(best.tables, base, bench.T_s)
     bad = [one[0] for one, calm in zip(fine, quiet(law, bench, plants, CHECK_S), strict=True) if not calm]
     if bad:
         raise HilError(
             f"unstable on a shaft with resonance at {', '.join(f'{hz:.0f}' for hz in bad)} Hz: "
-            "wish for less (--u-noise-mv, --ms), stiffen or damp the shaft"
+            f"wish for less ({'--u-noise-mv' if bench.inner is None else '--command-noise'}, --ms), stiffen "
+            "or damp the shaft"
         )
 
 
@@ -156,11 +177,11 @@ def _result(best: Tuned, front: Sequence[Tuned], spec: LawSpec, bench: Bench, ls
         "law": best.family.law,
         "tables": best.tables,
         "poles": {key: value for key, value in best.tables["controller"].items() if key != "kind"},
-        "windows": figures(spec, bench, lsb),
-        **verdict.as_dict(),
-        "margins": margins(law, bench, rigid(bench.motor, bench.T_s)),
+        "windows": figures(spec, bench, lsb) if bench.inner is None else own_loop_figures(law, bench, lsb),
+        **verdict.as_dict(bench.unit),
+        "margins": margins(law, bench, bench.plant(bench.motor)),
         "limited_by": list(best.limits_it),
         "bench": asdict(bench),
-        "front": [{"toml": toml(one.tables), **one.verdict.as_dict()} for one in points],
+        "front": [{"toml": toml(one.tables), **one.verdict.as_dict(bench.unit)} for one in points],
         "toml": toml(best.tables),
     }

@@ -1,8 +1,9 @@
 """The laws that can be tuned: what each leaves free, its bounds, and the config tables that follow.
 
-A family is a law and an observer of the registry with free numbers. Bounds are in units of the tick and of
-the motor, so that one family serves every drive. Poles of the paper's window follow its
-length: gamma D = 0.3, 0.7.
+A family is a law and an observer of the registry with free numbers; one for a drive with a current loop of
+its own (``OWN_LOOP``) has the same observer on the speed alone, under the law ``speed``. Bounds are in
+units of the tick and of the motor, so that one family serves every drive. Poles of the paper's window follow
+its length: gamma D = 0.3, 0.7.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from hil.errors import HilError
 from hil.tuning.measure import Bench
 
 Tables = dict[str, dict[str, Any]]
-"""``controller``, ``speed`` and ``current`` as the config takes them."""
+"""``controller``, ``speed`` and, of a drive that takes voltages, ``current``, as the config takes them."""
 Bounds = Sequence[tuple[float, float]]
 
 _POLES: Final = ((0.005, 0.4), (0.25, 1.5))
@@ -33,10 +34,11 @@ class Family:
     free: Bounds
     tables: Callable[[Sequence[float], Bench], Tables]
     whole: tuple[int, ...] = ()
+    own_loop: bool = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """To another process by its name."""
-        return family, (self.law,)
+        return family, (self.law, self.own_loop)
 
 
 def _cascade(x: Sequence[float], bench: Bench) -> dict[str, Any]:
@@ -48,7 +50,8 @@ def _cascade(x: Sequence[float], bench: Bench) -> dict[str, Any]:
 
 
 def _ms(ticks: float, bench: Bench) -> float:
-    return round(max(1, round(ticks)) * bench.T_s * 1e3, 6)
+    """Of whole samples: ticks, where each has a measurement."""
+    return round(max(1, round(ticks)) * bench.every * bench.T_s * 1e3, 6)
 
 
 def _noise(bench: Bench) -> dict[str, float]:
@@ -180,6 +183,47 @@ FAMILIES: Final[dict[str, Family]] = {
         _windowed("ramp-exact", "ramp-exact window", _ramp_tables),
     )
 }
+
+
+def _speed(channel: Callable[[float, Bench], dict[str, Any]]) -> Callable[[Sequence[float], Bench], Tables]:
+    """The law ``speed`` over one window, of x[1] samples."""
+
+    def tables(x: Sequence[float], bench: Bench) -> Tables:
+        controller = {"kind": "speed", "speed_pole_rad_s": round(float(x[0]) / bench.T_s, 2)}
+        return {"controller": controller, "speed": channel(x[1], bench)}
+
+    return tables
+
+
+def _speed_eso(x: Sequence[float], bench: Bench) -> Tables:
+    """x[1:3]: bandwidth times T_s, damping."""
+    eso = {"kind": "eso", "bandwidth_rad_s": round(x[1] / bench.T_s, 2), "damping": round(x[2], 3)}
+    return _speed(lambda _, __: eso)(x, bench)
+
+
+def _of_speed(
+    law: str, tables: Callable[[Sequence[float], Bench], Tables], *free: tuple[float, float]
+) -> Family:
+    """The family of that name for a drive with a current loop of its own; one length in whole samples."""
+    window = not free
+    bounds = (_SPEED_POLE, *(free or _LENGTH[:1]))
+    return Family(law, FAMILIES[law].doc, bounds, tables, (1,) if window else (), own_loop=True)
+
+
+_SPEED_POLE: Final = (0.002, 0.4)
+OWN_LOOP: Final[dict[str, Family]] = {
+    family.law: family
+    for family in (
+        _of_speed("dob", _speed(_dob_channel), _GAMMA[0]),
+        _of_speed("eso", _speed_eso, _GAMMA[0], (0.5, 1.0)),
+        _of_speed("ftdob", _speed(_paper)),
+        _of_speed("least-noise", _speed(_least)),
+        _of_speed("cubic", _speed(_cubic)),
+        _of_speed("exponentials", _speed(_three)),
+        _of_speed("ramp-exact", _speed(_ramp)),
+    )
+}
+"""The same for drives with a current loop of their own; the others command voltages, or need x_hat."""
 OTHER_NAMES: Final[Mapping[str, str]] = {
     "kalman-lq": "kalman",
     "lqg": "kalman",
@@ -193,12 +237,16 @@ OTHER_NAMES: Final[Mapping[str, str]] = {
 DEFAULT_LAWS: Final = ("pi", "dob", "eso", "kalman", "ftdob", "least-noise", "cubic", "adaptive")
 
 
-def family(name: str) -> Family:
-    """The family of that name. Raises HilError that lists them."""
-    found = FAMILIES.get(OTHER_NAMES.get(name, name))
-    if found is None:
-        raise HilError(f"--laws: no law {name!r}; there are {', '.join(FAMILIES)}")
-    return found
+def family(name: str, own_loop: bool = False) -> Family:
+    """The family of that name, for drives by voltage or with a loop of their own. Raises HilError."""
+    known, law = OWN_LOOP if own_loop else FAMILIES, OTHER_NAMES.get(name, name)
+    if law in known:
+        return known[law]
+    if law in FAMILIES:
+        raise HilError(
+            f"--laws: {law} is not for a drive with a current loop of its own; there are {', '.join(known)}"
+        )
+    raise HilError(f"--laws: no law {name!r}; there are {', '.join(known)}")
 
 
 def settings_of(tables: Tables) -> tuple[str, ...]:

@@ -27,31 +27,36 @@ NO_LIMIT: Final = 1e300
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """x+ = A x + b u + e T_L with x = (w, i_q, ...): A (n, n), b and e (n,)."""
+    """x+ = A x + b u + e T_L, y = C x, x = (w, i_q, ...): A (n, n), b, e, C (n,); y is what is told of w."""
 
     A: Array
     b: Array
     e: Array
+    C: Array
 
 
-def _sampled(A: Array, B: Array, T_s: float) -> Plant:
-    """Exact for u and T_L held over a tick; B (n, 2)."""
+def sampled(A: Array, B: Array, T_s: float, C: Array | None = None) -> Plant:
+    """Exact for u and T_L held over a tick; B (n, 2); y = w where no C is given."""
     n = len(A)
     whole = np.zeros((n + 2, n + 2))
     whole[:n, :n], whole[:n, n:] = A, B
     step = expm(whole * T_s)
-    return Plant(*(np.ascontiguousarray(part) for part in (step[:n, :n], step[:n, n], step[:n, n + 1])))
+    parts = step[:n, :n], step[:n, n], step[:n, n + 1], np.eye(n)[0] if C is None else C
+    return Plant(*(np.ascontiguousarray(part) for part in parts))
 
 
-def rigid(motor: MotorModel, T_s: float) -> Plant:
-    """Motor and load as one inertia."""
-    return _sampled(motor.A()[:2, :2], np.array([[0.0, -1 / motor.J], [1 / motor.L_q, 0.0]]), T_s)
+def one_mass(motor: MotorModel) -> tuple[Array, Array]:
+    """A (2, 2) of (w, i_q), and what a load torque does to it (2,)."""
+    return motor.A()[:2, :2], np.array([-1 / motor.J, 0.0])
 
 
-def shaft(motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share: float = 0.5) -> Plant:
-    """Two inertias on an elastic shaft: resonance [Hz], its damping, the motor's share of J.
+def two_masses(
+    motor: MotorModel, hz: float, damping: float = 0.01, share: float = 0.5
+) -> tuple[Array, Array]:
+    """A (4, 4) and the load's effect (4,): two inertias on an elastic shaft.
 
-    x = (w, i_q, torsion, w_load); k = w_r^2 J_m J_l / J, c = 2 damping k / w_r.
+    Resonance [Hz], its damping, the motor's share of J; x = (w, i_q, torsion, w_load);
+    k = w_r^2 J_m J_l / J, c = 2 damping k / w_r.
     """
     J_m, J_l, w_r = motor.J * share, motor.J * (1 - share), 2 * np.pi * hz
     k = w_r**2 * J_m * J_l / motor.J
@@ -61,7 +66,22 @@ def shaft(motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share
     A[1, :2] = motor.A()[1, :2]
     A[2] = 1, 0, 0, -1
     A[3] = c / J_l, 0, k / J_l, -c / J_l
-    return _sampled(A, np.array([[0.0, 0.0], [1 / motor.L_q, 0.0], [0.0, 0.0], [0.0, -1 / J_l]]), T_s)
+    return A, np.array([0.0, 0.0, 0.0, -1 / J_l])
+
+
+def rigid(motor: MotorModel, T_s: float) -> Plant:
+    """Motor and load as one inertia."""
+    return _by_voltage(motor, T_s, *one_mass(motor))
+
+
+def shaft(motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share: float = 0.5) -> Plant:
+    """Motor and load on an elastic shaft (:func:`two_masses`)."""
+    return _by_voltage(motor, T_s, *two_masses(motor, hz, damping, share))
+
+
+def _by_voltage(motor: MotorModel, T_s: float, A: Array, load: Array) -> Plant:
+    """u is the q voltage."""
+    return sampled(A, np.column_stack([np.eye(len(A))[1] / motor.L_q, load]), T_s)
 
 
 @jit

@@ -1,7 +1,9 @@
 """What a law is judged by on the linear loop: dip, recovery, IAE, noise, sensitivity, margins, corners.
 
-S = 1 / (1 + L) is the transfer function from a voltage that nobody announced to the voltage at the plant:
-    Ms = max |S|,  and from L = 1 / S - 1 gain, phase and delay margin.
+S = 1 / (1 + L) is the transfer function from a voltage that nobody announced to the voltage at the plant
+(:mod:`hil.tuning.sensitivity`); of a drive with its own current loop from a step of the reported speed that
+nobody filtered to what the observer gets (:mod:`hil.tuning.current`), as `hil check` has it. Its dip is that
+of the reported speed, which logs have and `hil report` judges.
 A law with an adaptive window is two linear loops: that of the short window, whose margins count, and that of
 the long one, whose noise it has. Dip, recovery and IAE are of the window as it runs; Ms is the larger one.
 """
@@ -17,18 +19,32 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from hil.control.law import MotorModel, new_law_state
+from hil.control.law import SPEED, MotorModel, new_law_state
 from hil.control.linalg import Array
+from hil.control.registry import InnerLoop, SpeedFilter
 from hil.report.metrics import RECOVERED_RAD_S
-from hil.tuning.loop import LOAD, PULSE_I, PULSE_U, PULSE_W, Plant, Record, respond_all, rigid, shaft
+from hil.tuning.current import respond_each, shaft_of
+from hil.tuning.loop import (
+    LOAD,
+    PULSE_I,
+    PULSE_U,
+    PULSE_W,
+    Plant,
+    Record,
+    respond_all,
+    rigid,
+    shaft,
+    two_masses,
+)
+from hil.tuning.sensitivity import margins_of, peak_of
 
 RESPONSE_S: Final = 0.4
 """Length of the responses; a loop that has not come to rest by then counts as unstable."""
 RESTLESS: Final = 0.1
 """Share of the dip that may be left in the last tenth of the response."""
-POINTS: Final = 1 << 11
 _MODES: Final[tuple[Literal["short", "N"], ...]] = ("short", "N")
-_STEP, _NOISE = np.array([LOAD, PULSE_U]), np.array([PULSE_W, PULSE_I])
+_STEP, _OWN_STEP = np.array([LOAD, PULSE_U]), np.array([LOAD, PULSE_W])
+_NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U])
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +54,8 @@ class Bench:
     Noises are standard deviations with the resolution in them; at a speed ``w_0`` [rad/s] decoupling adds
     n_p w_0 L_d i_d's noise to u_q; ``spread`` is the share by which J, psi_f, R_s
     and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with;
-    ``i_d_noise`` is that of i_d where its frame is coarser than i_q's.
+    ``i_d_noise`` is that of i_d where its frame is coarser than i_q's. Of a drive with a current loop of its
+    own (``inner``) u is in its ``unit``, A or N m, and ``filter`` is what its speed really comes through.
     """
 
     motor: MotorModel
@@ -51,28 +68,44 @@ class Bench:
     spread: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3))
     shafts: tuple[tuple[float, float, float], ...] = ()
     i_d_noise: float = 0.0
+    inner: InnerLoop | None = None
+    filter: SpeedFilter | None = None
+    unit: str = "V"
+
+    @property
+    def every(self) -> int:
+        """Ticks from one measurement to the next."""
+        return 1 if self.inner is None else self.inner.every
 
     @property
     def ticks(self) -> int:
-        """Length of a response."""
-        return min(max(round(RESPONSE_S / self.T_s), 200), 8000)
+        """Length of a response; a loop that measures seldom takes longer to come to rest."""
+        return min(max(round(RESPONSE_S / self.T_s), 200) * min(self.every, 5), 8000)
 
     def corners(self) -> list[MotorModel]:
         """The motors at the corners of the spread."""
         signs = [(1 - share, 1 + share) if share else (1.0,) for share in self.spread.values()]
-        return [self._off(*factors) for factors in itertools.product(*signs) if set(factors) != {1.0}]
+        every = (dict(zip(self.spread, factors, strict=True)) for factors in itertools.product(*signs))
+        return [self._off(**factors) for factors in every if set(factors.values()) != {1.0}]
 
-    def _off(self, J: float, psi_f: float, R_s: float, L: float) -> MotorModel:
+    def _off(self, J: float = 1.0, psi_f: float = 1.0, R_s: float = 1.0, L: float = 1.0) -> MotorModel:
         m = self.motor
         return replace(m, J=m.J * J, psi_f=m.psi_f * psi_f, R_s=m.R_s * R_s, L_d=m.L_d * L, L_q=m.L_q * L)
 
     def plants(self) -> list[Plant]:
         """The believed motor, then every corner."""
-        return [rigid(motor, self.T_s) for motor in (self.motor, *self.corners())]
+        return [self.plant(motor) for motor in (self.motor, *self.corners())]
+
+    def plant(self, motor: MotorModel, at: tuple[float, float, float] | None = None) -> Plant:
+        """A motor, on an elastic shaft (Hz, damping, share) where one is given, behind what drives it."""
+        if self.inner is None:
+            return shaft(motor, self.T_s, *at) if at else rigid(motor, self.T_s)
+        inner = replace(self.inner, k_u=self.inner.k_u * motor.k_t / self.motor.k_t)
+        return shaft_of(motor, inner, self.filter, self.T_s, two_masses(motor, *at) if at else None)
 
     def shaft_plants(self) -> list[Plant]:
         """The believed motor on its elastic shafts."""
-        return [shaft(self.motor, self.T_s, *one) for one in self.shafts]
+        return [self.plant(self.motor, one) for one in self.shafts]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,16 +137,32 @@ def _state() -> Record:
     return new_law_state()
 
 
-def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int) -> Array:
-    """Responses (plants, kinds, 4, ticks), valid until the next call; without the limit of the current."""
+def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int, closed: bool = True) -> Array:
+    """Responses (plants, kinds, 4, ticks), valid until the next call; without the limit of the current.
+
+    Not ``closed``: those of the observer alone, of a drive with a current loop of its own.
+    """
     own = law.copy()
     own["cogs"] = 0  # known over the angle: no part of the linear loop
     own["i_max"] = np.inf
     out = _buffer((len(plants), len(kinds), 4, ticks))
-    A, b, e = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "b", "e"))
+    A, b, e, C = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "b", "e", "C"))
     with np.errstate(over="ignore", invalid="ignore"):
-        respond_all(own[0], _state()[0], A, b, e, kinds, out)
+        if own_loop(law):
+            respond_each(own[0], _state()[0], A, b, e, C, kinds, closed, out)
+        else:
+            respond_all(own[0], _state()[0], A, b, e, kinds, out)
     return out
+
+
+def own_loop(law: Record) -> bool:
+    """Whether the law is one for a drive with a current loop of its own."""
+    return bool(law["kind"][0] == SPEED)
+
+
+def _steps(law: Record) -> Array:
+    """A step of the load, and the pulse that S is the response to."""
+    return _OWN_STEP if own_loop(law) else _STEP
 
 
 def adapts(law: Record) -> bool:
@@ -155,72 +204,42 @@ def _joined(whole: Loop, short: Loop, long: Loop) -> Loop:
 
 
 def _loops(law: Record, bench: Bench, plants: Sequence[Plant]) -> list[Loop]:
-    out = responses(law, plants, _STEP, bench.ticks)
-    return [_loop(one[0, 2] * bench.load, one[1, 1], bench.T_s) for one in out]
+    out, told = responses(law, plants, _steps(law), bench.ticks), 1 if own_loop(law) else 2
+    return [_loop(one[0, told] * bench.load, one[1, 1, :: bench.every], bench.T_s) for one in out]
 
 
 def _loop(w: Array, u: Array, T_s: float) -> Loop:
-    """Measures from speed after the load step and voltage after the pulse."""
+    """Measures from speed after the load step, and from what acts after the pulse on it."""
     error, tail = np.abs(w), len(w) // 10
     if not (np.isfinite(w).all() and np.isfinite(u).all()) or error[-tail:].max() > RESTLESS * error.max():
         return UNSTABLE
-    if np.abs(u[-tail:]).max() > 0.01:
+    if np.abs(u[-(len(u) // 10) :]).max() > 0.01:
         return UNSTABLE
     outside = np.nonzero(error > RECOVERED_RAD_S)[0]
     recovery = (int(outside[-1]) + 1) * T_s * 1e3 if len(outside) else 0.0
     return Loop(float(error.max()), recovery, float(error.sum() * T_s), peak_of(u))
 
 
-def peak_of(pulse: Array) -> float:
-    """Ms, the largest |S|, from the response of what acts to a unit pulse added to it."""
-    return float(np.abs(np.fft.rfft(pulse, max(POINTS, len(pulse)))).max())
-
-
 def noise(law: Record, bench: Bench, plant: Plant) -> tuple[float, float]:
-    """Noise of u_q [V] and of the true speed [rad/s], rms, for the noise that the bench has; at rest."""
+    """Noise of the command [bench.unit] and of the true speed [rad/s], rms, for the bench's; at rest."""
     law = held(law, "N")
-    kinds = np.r_[_NOISE, PULSE_U]
-    out = responses(law, [plant], kinds, bench.ticks)[0]
-    sigma = np.array([bench.w_noise, bench.i_noise, bench.u_noise])
-    energy = (out[:, (0, 2)] ** 2).sum(axis=2)
+    out = responses(law, [plant], _NOISE, bench.ticks)[0]
+    u_i = 1.0 if bench.inner is None else bench.inner.u_i
+    sigma = np.array([bench.w_noise, bench.i_noise * u_i, bench.u_noise])
+    energy = (out[:, (0, 2)] ** 2).sum(axis=2) / bench.every
     u, w = np.sqrt((sigma[:, None] ** 2 * energy).sum(axis=0))
+    if own_loop(law):
+        return float(u), float(w)
     decoupling = bench.motor.n_p * bench.w_0 * bench.motor.L_d * bench.i_noise if law["coupling"][0] else 0.0
     if F := int(law["N"][0, 2] - law["short"][0, 2]) if law["short"][0, 2] else 0:
         decoupling *= math.sqrt(2.0 * (2 * F + 1) / ((F + 1) * (F + 2)))  # the end of a line through F + 1
     return math.hypot(float(u), decoupling), float(w)
 
 
-@dataclass(frozen=True, slots=True)
-class Margins:
-    """Gain margin, phase margin [deg], delay margin [ms]."""
-
-    gain: float
-    phase_deg: float
-    delay_ms: float
-
-
 def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
-    """Gain margin, phase margin [deg], delay margin [ms] at the plant's voltage; of the short window."""
-    return asdict(
-        margins_of(responses(held(law, "short"), [plant], _STEP[1:], bench.ticks)[0, 0, 1], bench.T_s)
-    )
-
-
-def margins_of(pulse: Array, T_s: float) -> Margins:
-    """Margins from the response of what acts to a unit pulse added to it: S, and L = 1 / S - 1."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        L = 1 / np.fft.rfft(pulse, 1 << 16) - 1
-    w = np.linspace(0, np.pi / T_s, len(L))[1:-1]
-    L = L[1:-1]
-    cross = np.nonzero((np.abs(L[:-1]) - 1) * (np.abs(L[1:]) - 1) <= 0)[0]
-    real = np.nonzero((L[:-1].imag * L[1:].imag <= 0) & (L[:-1].real < 0) & (np.abs(L[:-1]) < 1))[0]
-    gains, phases = 1 / np.abs(L[real]), np.angle(-L[cross])
-    delays = phases % (2 * np.pi) / w[cross] * 1e3
-    return Margins(
-        float(gains.min(initial=math.inf)),
-        float(np.degrees(np.abs(phases)).min(initial=math.inf)),
-        float(delays.min(initial=math.inf)),
-    )
+    """Gain margin, phase margin [deg], delay margin [ms] where S is; of the short window."""
+    pulse = responses(held(law, "short"), [plant], _steps(law)[1:], bench.ticks)[0, 0, 1, :: bench.every]
+    return asdict(margins_of(pulse, bench.every * bench.T_s))
 
 
 def quiet(law: Record, bench: Bench, plants: Sequence[Plant], seconds: float = 1.2) -> list[bool]:
@@ -238,6 +257,16 @@ def quiet(law: Record, bench: Bench, plants: Sequence[Plant], seconds: float = 1
     return [bool(b < a or b < 1e-6) for a, b in zip(first, last, strict=True)]
 
 
+def noise_in(unit: str, value: float) -> dict[str, float]:
+    """Noise of the command by its key: mV of voltages, the unit itself (A, N m) of others."""
+    return {"u_noise_mv": value * 1e3} if unit == "V" else {"command_noise": value}
+
+
+def noise_text(value: float, unit: str) -> str:
+    """The same in words."""
+    return f"{value * 1e3:.1f} mV" if unit == "V" else f"{value:.3g} {unit}"
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """All measures of a law: nominal and over the corners."""
@@ -247,13 +276,13 @@ class Verdict:
     u_noise: float
     w_noise: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """JSON form, noise in mV and mrad/s."""
+    def as_dict(self, unit: str = "V") -> dict[str, Any]:
+        """JSON form, noise in mV or the command's own unit, and in mrad/s."""
         return {
             "dip": self.nominal.dip,
             "recovery_ms": self.nominal.recovery_ms,
             "iae": self.nominal.iae,
-            "u_noise_mv": self.u_noise * 1e3,
+            **noise_in(unit, self.u_noise),
             "w_noise_mrad_s": self.w_noise * 1e3,
             "ms": self.nominal.ms,
             "ms_worst": self.worst.ms,

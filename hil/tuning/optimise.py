@@ -8,7 +8,7 @@ and takes up the corner that broke a limit. Seeded: the same wish gives the same
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
@@ -31,7 +31,7 @@ REPAIRS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Largest noise in u_q [V], Ms nominal and in the worst corner, dip [rad/s] and recovery [ms]."""
+    """Largest noise in the command [V, A, N m], Ms, that of the worst corner, dip [rad/s], recovery [ms]."""
 
     u_noise: float = math.inf
     ms: float = math.inf
@@ -227,7 +227,7 @@ def _use(verdict: Verdict, limits: Limits) -> dict[str, float]:
 
 
 def _decisive(search: _Search) -> list[Plant]:
-    """Corners to begin with: those in which the plant's gain of voltage to speed is largest and least."""
+    """Corners to begin with: those in which the plant's gain of command to speed is largest and least."""
     gain = [float(plant.A[0, 1] * plant.b[1]) for plant in search.every]
     order = np.argsort(gain)
     half = FIRST_CORNERS // 2
@@ -235,11 +235,12 @@ def _decisive(search: _Search) -> list[Plant]:
 
 
 def spec_of(tables: Tables, base: LawSpec) -> LawSpec:
-    """``base`` with another law and other observers."""
-    kinds = {name: table["kind"] for name, table in tables.items()}
-    law = complete(tables["controller"], laws()[kinds["controller"]])
-    speed, current = (
-        ChannelSpec(kinds[name], more=complete(tables[name], observers()[kinds[name]]))
-        for name in ("speed", "current")
-    )
-    return replace(base, kind=kinds["controller"], more=law, speed=speed, current=current)
+    """``base`` with another law and other observers; one that is given for the speed alone is of both."""
+    controller = tables["controller"]
+    law = complete(controller, laws()[controller["kind"]])
+    speed, current = (_channel(tables.get(name, tables["speed"])) for name in ("speed", "current"))
+    return replace(base, kind=controller["kind"], more=law, speed=speed, current=current)
+
+
+def _channel(table: Mapping[str, Any]) -> ChannelSpec:
+    return ChannelSpec(table["kind"], more=complete(table, observers()[table["kind"]]))

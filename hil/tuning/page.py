@@ -17,10 +17,25 @@ COLUMNS: Final = {
     "recovery_ms": ("back in 0.5 rad/s [ms]", "{:.0f}"),
     "iae": ("IAE [rad]", "{:.3f}"),
     "u_noise_mv": ("noise of u_q [mV]", "{:.1f}"),
+    "command_noise": ("noise of the command [{unit}]", "{:.3g}"),
     "ms": ("Ms", "{:.2f}"),
     "ms_worst": ("Ms, worst corner", "{:.2f}"),
     "worst_dip": ("dip, worst corner [rad/s]", "{:.2f}"),
 }
+
+
+def columns(found: dict[str, Any]) -> dict[str, str]:
+    """Titles of the columns that a comparison or a design has, by their keys."""
+    unit = found["bench"]["unit"]
+    other = "u_noise_mv" if unit != "V" else "command_noise"
+    return {key: title.format(unit=unit) for key, (title, _) in COLUMNS.items() if key != other}
+
+
+def noise_of(found: dict[str, Any], unit: str) -> str:
+    """The noise of a row, a design or a limit, with its unit."""
+    return (
+        f"u_q {found['u_noise_mv']:.1f} mV" if unit == "V" else f"command {found['command_noise']:.3g} {unit}"
+    )
 
 
 def cell(row: dict[str, Any], name: str) -> str:
@@ -70,16 +85,18 @@ def bars(rows: Sequence[dict[str, Any]]) -> bytes:
 def comparison(found: dict[str, Any]) -> str:
     """The page of a comparison."""
     rows = [found["as_configured"], *found["rows"]]
-    head = "".join(f"<th>{escape(title)}</th>" for title, _ in COLUMNS.values())
+    titles = columns(found)
+    head = "".join(f"<th>{escape(title)}</th>" for title in titles.values())
     lines = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell(r, n))}</td>" for n in COLUMNS) + "</tr>" for r in rows
+        "<tr>" + "".join(f"<td>{escape(cell(r, n))}</td>" for n in titles) + "</tr>" for r in rows
     )
     limits, bench = found["limits"], found["bench"]
     text = (
         f"<p>{escape(found['config'])}: load step of {bench['load']:g} N m. Every law is tuned by the same "
-        f"optimiser for the least worst-corner IAE under the same limits: noise in u_q "
-        f"{limits['u_noise_mv']:.1f} mV, Ms {limits['ms']:.2f} nominal and {limits['ms_worst']:.2f} in the "
-        f"worst corner (linear loop); then run in the simulation with the same seeds {found['seeds']}.</p>"
+        f"optimiser for the least worst-corner IAE under the same limits: noise in "
+        f"{noise_of(limits, bench['unit'])}, Ms {limits['ms']:.2f} nominal and {limits['ms_worst']:.2f} in "
+        "the worst corner (linear loop); then run in the simulation with the same seeds "
+        f"{found['seeds']}.</p>"
     )
     designs = "".join(
         f"<h3>{escape(row['law'])}: {escape(row['what'])}</h3><pre>{escape(row['toml'])}</pre>"
@@ -91,27 +108,27 @@ def comparison(found: dict[str, Any]) -> str:
 
 
 def front_picture(found: dict[str, Any], path: Path) -> None:
-    """The front as a PNG: dip against noise of u_q, nominal and in the worst corner, the design marked."""
+    """The front as a PNG: dip against the command's noise, nominal and worst corner, the design marked."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.5, 4.5))
     axes = figure.subplots()
-    noise = [point["u_noise_mv"] for point in found["front"]]
-    for key, label, color in (("worst_dip", "worst corner", "#8a5a00"), ("dip", "nominal", "#2b6ca3")):
+    key = "u_noise_mv" if found["bench"]["unit"] == "V" else "command_noise"
+    title, form = columns(found)[key], "{:.0f}" if key == "u_noise_mv" else "{:.2g}"
+    noise = [point[key] for point in found["front"]]
+    for name, label, color in (("worst_dip", "worst corner", "#8a5a00"), ("dip", "nominal", "#2b6ca3")):
         axes.plot(
-            noise, [point[key] for point in found["front"]], "o-", color=color, label=label, mfc="white"
+            noise, [point[name] for point in found["front"]], "o-", color=color, label=label, mfc="white"
         )
-        axes.plot(found["u_noise_mv"], found[key], "o", color=color, ms=9)
+        axes.plot(found[key], found[name], "o", color=color, ms=9)
     for point in found["front"]:
         text = f"{point['recovery_ms']:.0f} ms"
-        axes.annotate(
-            text, (point["u_noise_mv"], point["dip"]), (0, -14), textcoords="offset points", ha="center"
-        )
+        axes.annotate(text, (point[key], point["dip"]), (0, -14), textcoords="offset points", ha="center")
     axes.set_xscale("log")
-    axes.set_xticks(noise, [f"{value:.0f}" for value in noise])
+    axes.set_xticks(noise, [form.format(value) for value in noise])
     axes.minorticks_off()
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("noise of u_q [mV rms]")
+    axes.set_xlabel(title.replace("]", " rms]"))
     axes.set_ylabel("dip after the load step [rad/s]")
     axes.set_title(
         f"{found['law']}: what noise buys (full: the design; below: back within 0.5 rad/s)", fontsize=10

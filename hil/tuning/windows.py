@@ -6,10 +6,34 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.law import LawSpec, law_window, sampled_model
+from hil.control.law import LawSpec, exact_after, law_window, sampled_model
 from hil.control.linalg import Array
 from hil.control.observer import Window, bounds, impulse_response, parabola_weights, response_length
-from hil.tuning.measure import Bench
+from hil.tuning.loop import LOAD, PULSE_I, PULSE_W, Record
+from hil.tuning.measure import Bench, responses
+
+
+def own_loop_figures(law: Record, bench: Bench, lsb: Array) -> dict[str, dict[str, float]]:
+    """Figures of the speed channel of a drive with its own current loop, through what filters its speed.
+
+    By the observer's own kernels, which no command answers here: d_hat after a step of d, and after one LSB.
+    """
+    kinds = np.array([LOAD, PULSE_W, PULSE_I])
+    d = responses(law, [bench.plant(bench.motor)], kinds, bench.ticks, closed=False)[0, :, 3]
+    step, by_w, by_i = -bench.motor.J * d[0], d[1], d[2] * law["u_i"][0]
+    energy, size = ((by_w**2).sum(), (by_i**2).sum()), (np.abs(by_w).sum(), np.abs(by_i).sum())
+    sigma = np.array([bench.w_noise, bench.i_noise])
+    peak, N = float(np.abs(np.fft.rfft(np.diff(step, prepend=0.0))).max()), exact_after(law)[0]
+    own = {
+        "N": N,
+        "D_ms": N * bench.T_s * 1e3,
+        "sigma_d": float(np.sqrt((sigma**2 * energy).sum() / bench.every)),
+        "lag_ms": float((1.0 - step).sum() - 0.5) * bench.T_s * 1e3,
+        "peak_H": peak,
+        "mismatch_allowed": 1.0 / peak,
+        "lsb_bound": float((0.5 * lsb[:2] * size).sum()),
+    }
+    return {"speed": own}
 
 
 def figures(spec: LawSpec, bench: Bench, lsb: Array) -> dict[str, dict[str, float]]:

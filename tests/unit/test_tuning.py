@@ -265,9 +265,10 @@ def test_designs_that_can_not_be_are_refused(
 
 
 @pytest.mark.parametrize(
-    ("config", "said"), [("paper", "only speed drives"), ("current", "the margins of this one: hil check")]
+    ("config", "said"),
+    [("paper", "only speed drives"), ("current", "pi is not for a drive with a current loop")],
 )
-def test_what_asks_for_no_voltage_is_refused(
+def test_what_can_not_be_compared_is_refused(
     config: str, said: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     assert main(["compare", str(CONFIGS / f"{config}.toml"), "--laws", "pi", "-o", str(tmp_path)]) == 2
