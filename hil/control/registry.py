@@ -136,7 +136,7 @@ def register(member: Observer | Law) -> None:
     For a notebook or a trial; what is to run in the emulator's process, in workers and in a later replay
     is a package with an entry point. Raises ControlDesignError once the tables of the kinds are made.
     """
-    if "hil.config.tables" in sys.modules:
+    if "hil.config.law" in sys.modules:
         raise ControlDesignError(f"kind {member.kind!r}: register it before the first configuration is read")
     _REGISTERED.append(member)
     observers.cache_clear()
