@@ -108,6 +108,7 @@ class Judged:
             phases=self.phases,
             log=result,
             bus_load=lambda: None,
+            follows=self.config.controller.kind != "torque",
         )
         found = {figure.key: figure.of(run) for figure in FIGURES} | self._added(self.config.limits)
         limits = demanded(self.config.criteria)
