@@ -138,7 +138,7 @@ def test_a_stiff_shaft_is_a_rigid_one_and_a_soft_one_is_not() -> None:
 
 def test_design_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, config = tmp_path / "tuned.toml", str(CONFIGS / "moteus.toml")
-    wish = ["--law", "cubic", "--effort", "0.1", "--command-noise", "0.05", "-o", str(out), "--json"]
+    wish = ["--law", "cubic", "--effort", "0.3", "--command-noise", "0.05", "-o", str(out), "--json"]
     assert main(["design", config, *wish]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["command_noise"] <= 0.0503 and found["ms"] <= 1.61 and found["ms_worst"] <= 2.21
