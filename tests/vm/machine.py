@@ -153,7 +153,7 @@ def _qemu(kernel: Path, out: Path) -> list[str]:
     ]  # fmt: skip
 
 
-def _job(command: Sequence[str], compiled: Path) -> str:
+def _job(command: Sequence[str]) -> str:
     """What Python in the machine does once it is woken: interfaces up, kernels on its tmpfs, the command."""
     folders = [
         str(Path(sys.executable).parent),
@@ -171,7 +171,7 @@ def _job(command: Sequence[str], compiled: Path) -> str:
         "OPENBLAS_NUM_THREADS": "1",
     }
     setup = f"""\
-mkdir /dev/shm/numba && cp -rs {shlex.quote(str(compiled))}/. /dev/shm/numba
+mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels()))}/. /dev/shm/numba
 echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up
@@ -231,14 +231,6 @@ def warm_kernels() -> None:
     stamp.touch()
 
 
-def keep_kernels(into: Path) -> Path:
-    """A copy of the kernels, made now: others on the host may compile while the machine runs.
-
-    A file that is replaced while the machine reads it comes to it cut off.
-    """
-    return Path(shutil.copytree(kernels(), into / "kernels", ignore=shutil.ignore_patterns("*.tmp.*")))
-
-
 def run_in_machine(
     command: Sequence[str], *, timeout_s: float = TIMEOUT_S, out: Path | None = None
 ) -> Result:
@@ -252,19 +244,18 @@ def run_in_machine(
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("stdout", "stderr", "code"):
         (folder / name).unlink(missing_ok=True)
-    with tempfile.TemporaryDirectory(prefix="hil-kernels-") as kept:
-        (folder / "job.json").write_text(_job(command, keep_kernels(Path(kept))))
-        serial = folder / "serial.log"
-        wake = [*_qemu(kernel, folder), "-serial", "stdio", "-incoming", restored(image)]
-        try:
-            with serial.open("wb") as log:
-                subprocess.run(
-                    wake, input=WAKE, stdout=log, stderr=subprocess.PIPE, timeout=timeout_s, check=True
-                )
-        except subprocess.TimeoutExpired as error:
-            raise MachineError(f"the machine did not end within {timeout_s:g} s; see {serial}") from error
-        except subprocess.CalledProcessError as error:
-            raise MachineError(f"qemu failed: {error.stderr.decode(errors='replace').strip()}") from error
+    (folder / "job.json").write_text(_job(command))
+    serial = folder / "serial.log"
+    wake = [*_qemu(kernel, folder), "-serial", "stdio", "-incoming", restored(image)]
+    try:
+        with serial.open("wb") as log:
+            subprocess.run(
+                wake, input=WAKE, stdout=log, stderr=subprocess.PIPE, timeout=timeout_s, check=True
+            )
+    except subprocess.TimeoutExpired as error:
+        raise MachineError(f"the machine did not end within {timeout_s:g} s; see {serial}") from error
+    except subprocess.CalledProcessError as error:
+        raise MachineError(f"qemu failed: {error.stderr.decode(errors='replace').strip()}") from error
     if not (folder / "code").is_file():
         raise MachineError(f"the job left no exit code; see {serial}")
     return Result(
