@@ -9,10 +9,8 @@ import tempfile
 import uuid
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
-from xdist.scheduler import LoadScopeScheduling
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # small matrices; before numpy
     os.environ.setdefault(name, "1")
@@ -30,25 +28,6 @@ def pytest_unconfigure() -> None:
     """A worker's own folder goes with it."""
     if worker:
         shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
-
-
-class ByFile(LoadScopeScheduling):
-    """A file's tests stay with one worker, which makes once what they share; the bench machine boots once."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        path = nodeid.partition("::")[0]
-        return "tests/vm" if path.startswith("tests/vm/") else path
-
-
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> ByFile:
-    """What gives the tests to the workers."""
-    return ByFile(config, log)
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The bench machine takes longest: it begins."""
-    items.sort(key=lambda item: item.get_closest_marker("vm") is None)
 
 
 @pytest.fixture

@@ -56,7 +56,8 @@ def live_names(fields: Sequence[Field] = CURVES) -> list[str]:
 def live_plots(fields: Sequence[Field] = CURVES) -> list[tuple[str, list[tuple[str, str]]]]:
     """Title with the unit, and the curves as (key, label), for each plot of the page."""
     plots: dict[str, list[tuple[str, str]]] = {}
-    for field in sorted(fields, key=lambda field: live_names(fields).index(field.shown.live)):
+    names = live_names(fields)
+    for field in sorted(fields, key=lambda field: names.index(field.shown.live)):
         unit = COMMAND_UNIT if field.shown.live == "command" else field.drawn_unit
         title = f"{field.shown.live} [{unit}]"
         plots.setdefault(title, []).append((field.name, field.name.removesuffix("_ns")))
