@@ -12,6 +12,10 @@ from hil.control.law import MotorModel
 from hil.signals import DriveState, Request, TickArray
 
 RECOVERED_RAD_S = 0.5
+CHANGED_N_M = 0.5
+"""A load torque that changes by more from one tick to the next changes again."""
+SETTLED = 0.1
+"""A step goes on while the torque changes by more than this part of its first tick's jump."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +39,11 @@ class Lateness:
 
 @dataclass(frozen=True, slots=True)
 class LoadStep:
-    """Response to a step of the true load torque.
+    """Response to a step of the true load torque; of another machine's it takes some ticks to settle.
 
     ``dip`` [rad/s]: largest speed error after it; ``recovery_ms``: from the step until the error stays below
-    0.5 rad/s; ``estimate_error`` [rad/s2]: |d_hat_w - d_w| N ticks after the step, d_w the true one of the
-    period that the newest innovation covers; ``step`` [rad/s2]: what the load alone adds to d_w.
+    0.5 rad/s; ``estimate_error`` [rad/s2]: |d_hat_w - d_w| N ticks after it has settled, d_w the true one of
+    the period that the newest innovation covers; ``step`` [rad/s2]: what the load alone adds to d_w.
     """
 
     k: int
@@ -94,22 +98,32 @@ def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -
 def load_step(ticks: TickArray, N: int, believed: MotorModel, true: MotorModel) -> LoadStep | None:
     """Judge the response to the largest load step; N is the window of the speed channel [ticks]."""
     row = find_step(ticks)
-    if row is None or row < 50 or row + N + 1 >= len(ticks):
+    if row is None or row < 50:
         return None
-    end = _until(ticks, row)
+    settled = row + _moving(ticks["T_L_true"][row - 1 :])
+    if settled + N + 1 >= len(ticks):
+        return None
+    end = _until(ticks, settled)
     error = ticks["w"][row:end] - ticks["w_ref"][row:end]
     outside = np.nonzero(np.abs(error) > RECOVERED_RAD_S)[0]
-    period_ms = float(np.median(np.diff(ticks["t_ns"][row:end]))) * 1e-6
+    period_ms = float(np.median(np.diff(ticks["t_ns"][row - 1 : end]))) * 1e-6
     recovery = (int(outside[-1]) + 1) * period_ms if len(outside) else 0.0
-    true_step = -float(ticks["T_L_true"][row] - ticks["T_L_true"][row - 1]) / true.J
-    d_w = true_disturbance(ticks[row + N - 1 : row + N + 1], believed, true)
-    estimate_error = abs(float(ticks["d_hat_w"][row + N]) - float(d_w[0]))
+    true_step = -float(ticks["T_L_true"][settled] - ticks["T_L_true"][row - 1]) / true.J
+    d_w = true_disturbance(ticks[settled + N - 1 : settled + N + 1], believed, true)
+    estimate_error = abs(float(ticks["d_hat_w"][settled + N]) - float(d_w[0]))
     return LoadStep(int(ticks["k"][row]), float(np.abs(error).max()), recovery, estimate_error, true_step)
+
+
+def _moving(torque_n_m: npt.NDArray[np.float64]) -> int:
+    """For how many ticks after its first the step at the beginning goes on; NaN does not."""
+    jumps = np.abs(np.diff(torque_n_m))
+    still = ~(jumps[1:] > SETTLED * jumps[0])
+    return int(np.argmax(still)) if still.any() else len(still)
 
 
 def _until(ticks: TickArray, row: int) -> int:
     """First row after ``row`` at which the load or the reference changes again."""
-    load = np.abs(np.diff(ticks["T_L_true"][row:])) > 0.5
+    load = np.abs(np.diff(ticks["T_L_true"][row:])) > CHANGED_N_M
     moving = np.abs(ticks["dw_ref"][row + 1 :]) > 0
     changed = np.nonzero(load | moving | (ticks["state"][row + 1 :] != ticks["state"][row]))[0]
     return row + 1 + int(changed[0]) if len(changed) else len(ticks)
