@@ -137,6 +137,7 @@ class Together:
         words, first = self._words, self._axes[0]
         for axis in self._axes[1:]:
             axis.client.follow(axis.tick)
+            axis.client.flush()  # what came late stands before the SYNC in the log, too
         if words is not None and words[FIRED]:
             first.client.follow(first.tick)
         else:
@@ -220,6 +221,10 @@ class NodesLoop(Loop):
         self._answer(tick, deadline_ns)
         self._note(k, deadline_ns)
         return k
+
+    def _states(self) -> tuple[int, ...]:
+        """Of each node's supervisor."""
+        return tuple(axis.cells.state[0] for axis in self._axes)
 
     def _exchange(self, tick: Any, deadline_ns: int, due: bool) -> None:
         """SYNC out and feedback in; a SYNC that is not out is told to all."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from hil.control.law import ask, new_law_state
 from hil.errors import ConfigError
 from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
+from hil.runtime.nodes import Together
 from hil.runtime.nodesetup import load_node_setups, nodes_load
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import new_ticks
@@ -265,6 +267,25 @@ def test_a_flood_for_one_does_not_hold_the_other() -> None:
     hub, link = hub_of(*[(0x185, 0)] * (READ_MOST + 10))
     assert hub.ports[1].receive(0) is None and len(link.frames) == 10
     assert hub.ports[0].discard() == READ_MOST + 10 and hub.ports[0].receive(0) is None
+
+
+def test_what_came_late_is_logged_before_the_next_sync() -> None:
+    """Replay reads the frames in the log's order: after SYNC they would be the new tick's measurements."""
+    did: list[str] = []
+
+    class Noted:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def __getattr__(self, what: str) -> Any:
+            return lambda *_: did.append(f"{self.name} {what}")
+
+    clients = [SimpleNamespace(client=Noted(name), tick=None) for name in ("motor", "load")]
+    Together(clients, None).exchange(None, 0)  # type: ignore[arg-type]
+    assert did == [
+        "load follow", "load flush", "motor sync",
+        "motor receive", "motor flush", "load receive", "load flush",
+    ]  # fmt: skip
 
 
 def test_what_a_node_hears_is_its_own() -> None:
