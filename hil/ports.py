@@ -5,6 +5,7 @@ The loop knows these and nothing behind them; the composition root hands in what
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 from hil.signals import TickArray
@@ -88,5 +89,5 @@ class Inbox(Protocol):
 
     number: Any
 
-    def take(self, state: int, asked: int) -> str:
-        """Judge what waits, for a supervisor in ``state`` and a Request; the event's text, or nothing yet."""
+    def take(self, states: Sequence[int], asked: int) -> str:
+        """Judge what waits, for the state of each node's supervisor; the event's text, or nothing yet."""

@@ -18,6 +18,12 @@ def register(commands: Commands) -> None:
     )
     command.add_argument("items", nargs="+", metavar="NAME=VALUE", help="w=60; one RUN may stand beside it")
     command.add_argument(
+        "--node",
+        default="",
+        metavar="NAME",
+        help="of a run with several nodes the one whose reference is set (default: the first)",
+    )
+    command.add_argument(
         "--run", dest="run_name", metavar="RUN", help="PID, channel or log; with several runs"
     )
 
@@ -44,19 +50,23 @@ def cmd_set(args: argparse.Namespace) -> int:
     """Set references."""
     from hil.errors import HilError
     from hil.runtime.inbox import SetpointError, ask, outside, shown
-    from hil.runtime.registry import choose
+    from hil.runtime.registry import choose, no_node
 
     values, runs = parsed(args.items)
     runs += [args.run_name] if args.run_name else []
     if not values or len(runs) > 1:
         raise HilError("say what to set and at most one run: hil set w=60 [PID, channel or log]")
     entry = choose(runs[0] if runs else None)
-    if why := outside(values, entry.takes):
-        raise SetpointError(f"{entry}: {why}; nothing was set")
-    ask(entry.pid, values, f"hil set, PID {os.getpid()}, user id {os.getuid()}")
+    if why := no_node(entry, args.node):
+        raise SetpointError(f"{why}; nothing was set")
+    takes, of = entry.takes_of(args.node), f"node {args.node} of {entry}" if args.node else str(entry)
+    if why := outside(values, takes):
+        raise SetpointError(f"{of}: {why}; nothing was set")
+    who = f"hil set, PID {os.getpid()}, user id {os.getuid()}"
+    ask(entry.pid, values, who, node=entry.place_of(args.node))
     if args.json:
-        rates = {name: entry.takes[name][2] for name in values}
-        print_json({"pid": entry.pid, "log": entry.log, "set": values, "rate": rates})
+        rates, node = {name: takes[name][2] for name in values}, {"node": args.node} if args.node else {}
+        print_json({"pid": entry.pid, "log": entry.log} | node | {"set": values, "rate": rates})
     else:
-        say(f"hil: {shown(values)} for {entry}")
+        say(f"hil: {shown(values)} for {of}")
     return 0

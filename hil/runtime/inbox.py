@@ -1,7 +1,8 @@
 """Live set-points from other processes of this user: a page of shared memory that the loop looks at.
 
-A client writes values, then their number and a check of both; the loop takes a set-point once, judges it by
-the config's range and answers with a code. It never waits, and what does not fit its check is not there.
+A client writes values and the place of the node they are for, then their number and a check of all; the loop
+takes a set-point once, judges it by that node's range and answers with a code. It never waits, and what does
+not fit its check is not there.
 Like the rings the page is a memfd: no name, only this user's processes can open it.
 """
 
@@ -13,7 +14,8 @@ import math
 import mmap
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any, Final
@@ -25,13 +27,15 @@ from hil.signals import DriveState, Request
 
 NAME: Final = "memfd:hil-setpoint"
 MAGIC: Final = 0x68696C5345545031
-MAGIC_AT, ASKED, HAS, W, I_Q, CHECK, ANSWERED, CODE = range(8)
+MAGIC_AT, ASKED, HAS, W, I_Q, CHECK, ANSWERED, CODE, NODE = range(9)
 WHO_AT, WHO_BYTES = 128, 200
 PARTS: Final = {"w": (1, W, "rad/s"), "i_q": (2, I_Q, "A")}
 """Bit, place and unit of what can be set."""
 ANSWER_S: Final = 2.0
 LOOK_NS: Final = 2_000_000
 MASK: Final = (1 << 63) - 1
+Takes = dict[str, tuple[float, float, float]]
+"""What may be set, by name: least, most, rate [SI]."""
 OPERATING, STOP = int(DriveState.OPERATION_ENABLED), int(Request.STOP)
 
 
@@ -47,6 +51,7 @@ class Answer(IntEnum):
     NOT_OPERATING = 2
     STOPPING = 3
     OUT_OF_RANGE = 4
+    NO_NODE = 5
 
 
 WORDS: Final = {
@@ -54,6 +59,7 @@ WORDS: Final = {
     Answer.NOT_OPERATING: "the drive is not in operation yet; ask again once the run says operation enabled",
     Answer.STOPPING: "the run is stopping; start another one",
     Answer.OUT_OF_RANGE: "out of the run's range",
+    Answer.NO_NODE: "the run has no such node",
 }
 
 
@@ -65,12 +71,12 @@ def _value(bits: int) -> float:
     return float(struct.unpack("<d", bits.to_bytes(8, "little", signed=True))[0])
 
 
-def _check(number: int, has: int, w: int, i_q: int) -> int:
-    """What ties the values to their number, so that the loop never takes half of a set-point."""
-    return (number * 0x9E3779B97F4A7C15 ^ has ^ w * 3 ^ i_q * 5) & MASK
+def _check(number: int, has: int, w: int, i_q: int, node: int) -> int:
+    """What ties values and node to their number, so that the loop never takes half of a set-point."""
+    return (number * 0x9E3779B97F4A7C15 ^ has ^ w * 3 ^ i_q * 5 ^ node * 7) & MASK
 
 
-def ranges(machine: Machine, law: str) -> dict[str, tuple[float, float, float]]:
+def ranges(machine: Machine, law: str) -> Takes:
     """What a law takes, by name: least, most, rate [SI]; nothing for a commanded torque, which has no w*."""
     if law == "torque":
         return {}
@@ -81,12 +87,20 @@ def ranges(machine: Machine, law: str) -> dict[str, tuple[float, float, float]]:
     return found
 
 
-class Inbox:
-    """The run's end of the page."""
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A node's controller, what may be set of it, and its name: none for the first and for one drive."""
 
-    def __init__(self, machine: Machine, takes: dict[str, tuple[float, float, float]]) -> None:
-        self._state: Any = machine.setpoint_state[0]
-        self._takes, self._seen = takes, 0
+    machine: Machine
+    takes: Takes
+    name: str = ""
+
+
+class Inbox:
+    """The run's end of the page; ``places``: its nodes, in the configuration's order."""
+
+    def __init__(self, *places: Place) -> None:
+        self._places, self._seen = places, 0
         self._fd = os.memfd_create(NAME.partition(":")[2], os.MFD_CLOEXEC)
         os.fchmod(self._fd, 0o600)
         os.posix_fallocate(self._fd, 0, mmap.PAGESIZE)
@@ -96,28 +110,29 @@ class Inbox:
         self.cells[MAGIC_AT] = MAGIC
         self.number: Any = self.cells[ASKED : ASKED + 1]
 
-    def take(self, state: int, asked: int) -> str:
-        """Judge the set-point that waits; return the text of its event, empty while it is not whole."""
+    def take(self, states: Sequence[int], asked: int) -> str:
+        """Judge the set-point that waits; return the text of its event, empty while it is not whole.
+
+        ``states``: of each node's supervisor.
+        """
         cells = self.cells
-        number, has, w, i_q = (cells[at] for at in (ASKED, HAS, W, I_Q))
-        if number == self._seen or cells[CHECK] != _check(number, has, w, i_q):
+        number, has, w, i_q, node = (cells[at] for at in (ASKED, HAS, W, I_Q, NODE))
+        if number == self._seen or cells[CHECK] != _check(number, has, w, i_q, node):
             return ""
         self._seen = number
         values = {name: _value(cells[at]) for name, (bit, at, _) in PARTS.items() if has & bit}
-        code = self._judge(values, state, asked)
+        code, name = Answer.NO_NODE, ""
+        if 0 <= node < len(self._places):
+            place = self._places[node]
+            code, name = _judged(values, place, states[node], asked), place.name
         if code is Answer.TAKEN:
-            for name, value in values.items():
-                self._state[f"live_{name}"], self._state[f"{name}_target"] = 1, value
+            state: Any = self._places[node].machine.setpoint_state[0]
+            for part, value in values.items():
+                state[f"live_{part}"], state[f"{part}_target"] = 1, value
         cells[CODE], cells[ANSWERED] = int(code), number
         who = bytes(self._page[WHO_AT : WHO_AT + WHO_BYTES]).partition(b"\0")[0].decode(errors="replace")
-        return f"{shown(values)}: {code.name.lower().replace('_', ' ')}, asked by {who}"
-
-    def _judge(self, values: dict[str, float], state: int, asked: int) -> Answer:
-        if asked >= STOP:
-            return Answer.STOPPING
-        if state != OPERATING:
-            return Answer.NOT_OPERATING
-        return Answer.OUT_OF_RANGE if outside(values, self._takes) else Answer.TAKEN
+        said = f"{shown(values)}: {code.name.lower().replace('_', ' ')}, asked by {who}"
+        return f"{name}: {said}" if name else said
 
     def close(self) -> None:
         """Let go of the page."""
@@ -126,12 +141,20 @@ class Inbox:
         os.close(self._fd)
 
 
+def _judged(values: dict[str, float], place: Place, state: int, asked: int) -> Answer:
+    if asked >= STOP:
+        return Answer.STOPPING
+    if state != OPERATING:
+        return Answer.NOT_OPERATING
+    return Answer.OUT_OF_RANGE if outside(values, place.takes) else Answer.TAKEN
+
+
 def shown(values: dict[str, float]) -> str:
     """Values with their units."""
     return ", ".join(f"{name} = {value:g} {PARTS[name][2]}" for name, value in values.items()) or "nothing"
 
 
-def outside(values: dict[str, float], takes: dict[str, tuple[float, float, float]]) -> str:
+def outside(values: dict[str, float], takes: Takes) -> str:
     """Why a run does not take the values, empty when it does."""
     for name, value in values.items():
         if name not in takes:
@@ -166,8 +189,11 @@ def _opened(pid: int) -> Iterator[tuple[Any, memoryview]]:
     )
 
 
-def ask(pid: int, values: dict[str, float], who: str, timeout_s: float = ANSWER_S) -> None:
-    """Ask a run for set-points and wait for its answer. Raises SetpointError with the reason of a refusal."""
+def ask(pid: int, values: dict[str, float], who: str, timeout_s: float = ANSWER_S, node: int = 0) -> None:
+    """Ask a run for set-points and wait for its answer. Raises SetpointError with the reason of a refusal.
+
+    ``node``: place of the node they are for, in the configuration's order.
+    """
     with _opened(pid) as (cells, page):
         number = cells[ASKED] + 1
         numbers = {at: _bits(values.get(name, 0.0)) for name, (_, at, _) in PARTS.items()}
@@ -175,8 +201,8 @@ def ask(pid: int, values: dict[str, float], who: str, timeout_s: float = ANSWER_
         page[WHO_AT : WHO_AT + WHO_BYTES] = who.encode(errors="replace")[: WHO_BYTES - 1].ljust(
             WHO_BYTES, b"\0"
         )
-        cells[W], cells[I_Q], cells[HAS] = numbers[W], numbers[I_Q], has
-        cells[CHECK] = _check(number, has, numbers[W], numbers[I_Q])
+        cells[W], cells[I_Q], cells[HAS], cells[NODE] = numbers[W], numbers[I_Q], has, node
+        cells[CHECK] = _check(number, has, numbers[W], numbers[I_Q], node)
         cells[ASKED] = number
         clock = RealClock()
         code, now_ns = Answer.NONE, clock.now_ns()

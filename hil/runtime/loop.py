@@ -269,9 +269,13 @@ class Loop:
     def _take(self, k: int, asked: int) -> None:
         """A set-point of another process, into the reference of this tick or refused."""
         assert self._inbox is not None  # noqa: S101 - without one the number stays 0
-        if text := self._inbox.take(self._cells.state[0], asked):
+        if text := self._inbox.take(self._states(), asked):
             self._taken = self._number[0]
             self._recorder.event(self._start_ns + k * self._plan.period_ns, k, "set-point", text)
+
+    def _states(self) -> tuple[int, ...]:
+        """Of each node's supervisor."""
+        return (self._cells.state[0],)
 
     def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> int:
         """What is left of a tick that got to ``stage``; return k, which may have moved on."""

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from drivers.client import DriveClient
 from drivers.hub import Hub
+from hil.config.design import Machine
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder, check_folder
 from hil.runtime import realtime
@@ -20,7 +21,7 @@ from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import Rights, Words, guardian
 from hil.runtime.header import header_of, log_path
-from hil.runtime.inbox import Inbox
+from hil.runtime.inbox import Inbox, Place, Takes
 from hil.runtime.loop import Outcome, StopRequest
 from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
 from hil.runtime.nodesetup import Nodes, check_nodes_load
@@ -150,17 +151,25 @@ def _recorded(
         machines = machines if request.ramps else [machine.at_once() for machine in machines]
         records = [recorder.record, *recorder.more_records]
         axes = [Axis(*parts) for parts in zip(setups, clients, machines, records, strict=True)]
-        takes = set_by_others(first)
-        inbox = held.enter_context(contextlib.closing(Inbox(machines[0], takes)))
+        takes = {name: set_by_others(setup) for name, setup in setups.items()}
+        inbox = held.enter_context(contextlib.closing(Inbox(*_places(machines, takes))))
         for client in clients:  # in operation after arming; every way out leaves it
             held.callback(client.leave)
             client.start()
             client.flush()
-        loop = NodesLoop(
-            axes, clock, recorder, plan_of(first.config), request, words, inbox if takes else None
-        )
+        box = inbox if any(takes.values()) else None
+        loop = NodesLoop(axes, clock, recorder, plan_of(first.config), request, words, box)
         clients[0].discard()
         return _run_armed(first, axes, loop, recorder, clock, request, takes)
+
+
+def _places(machines: Sequence[Machine], takes: Mapping[str, Takes]) -> list[Place]:
+    """What set-points may be set of; events of all but the first begin with the node's name."""
+    first = next(iter(takes))
+    return [
+        Place(machine, one, "" if name == first else name)
+        for machine, (name, one) in zip(machines, takes.items(), strict=True)
+    ]
 
 
 def nodes_header(setups: Nodes, clock: str) -> dict[str, Any]:
@@ -185,13 +194,12 @@ def _run_armed(
     recorder: Recorder,
     clock: Clock,
     request: StopRequest,
-    takes: dict[str, tuple[float, float, float]],
+    takes: Mapping[str, Takes],
 ) -> RunResult:
     outcome, failure, processor_ns = Outcome(), "", 0
     grants: list[realtime.Grant] = []
-    names = tuple(axis.name for axis in axes)
     try:
-        with driving(first.config, recorder, clock, request, takes, names) as grants:
+        with driving(first.config, recorder, clock, request, takes[axes[0].name], takes) as grants:
             begin_ns = time.thread_time_ns()
             outcome = loop.run()
             processor_ns = time.thread_time_ns() - begin_ns

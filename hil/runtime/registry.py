@@ -13,7 +13,7 @@ import os
 import signal
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -38,9 +38,19 @@ class Entry:
     ticks: int | None = None
     clock: str = "monotonic"
     takes: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    """What ``hil set`` may ask, by name: least, most, rate [SI]."""
+    """What ``hil set`` may ask, by name: least, most, rate [SI]; of several nodes, of the first."""
     nodes: tuple[str, ...] = ()
     """Of a run with several nodes their names, in the configuration's order."""
+    node_takes: dict[str, dict[str, tuple[float, float, float]]] = field(default_factory=dict)
+    """Of a run with several nodes what may be asked of each."""
+
+    def takes_of(self, node: str) -> dict[str, tuple[float, float, float]]:
+        """What may be asked of a node; empty: the first, or the one drive."""
+        return self.node_takes.get(node, {}) if node else self.takes
+
+    def place_of(self, node: str) -> int:
+        """A node's place in the configuration's order; empty: the first, or the one drive."""
+        return self.nodes.index(node) if node else 0
 
     def __str__(self) -> str:
         return f"PID {self.pid} on {self.bus}, log {self.log}"
@@ -119,11 +129,12 @@ def own_entry(
     ticks: int | None,
     clock: str = RealClock.name,
     takes: dict[str, tuple[float, float, float]] | None = None,
-    nodes: tuple[str, ...] = (),
+    nodes: Mapping[str, dict[str, tuple[float, float, float]]] | None = None,
 ) -> Entry:
     """The entry of this process; ``clock``: the name of its loop's."""
-    start = start_time(os.getpid()) or 0
-    return Entry(os.getpid(), start, str(log), bus, rate_hz, ticks, clock, takes or {}, nodes)
+    start, of_each = start_time(os.getpid()) or 0, dict(nodes or {})
+    named = takes or {}, tuple(of_each), of_each
+    return Entry(os.getpid(), start, str(log), bus, rate_hz, ticks, clock, *named)
 
 
 @contextlib.contextmanager
@@ -206,6 +217,14 @@ def _why_not(pid: int) -> str:
     if owner != os.getuid():
         return f"process {pid} belongs to another user (uid {owner}); only its owner can watch it"
     return f"process {pid} is no hil run"
+
+
+def no_node(entry: Entry, node: str) -> str:
+    """Why a run has no such node; empty where it has, and for none named."""
+    if not node or node in entry.nodes:
+        return ""
+    known = f"it has {' and '.join(entry.nodes)}" if entry.nodes else "it is of one drive: leave the node out"
+    return f"{entry} has no node {node!r:.40}; {known}"
 
 
 def ask_stop(entry: Entry, who: str, t_ns: int, k: int) -> bool:

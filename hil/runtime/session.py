@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -27,7 +27,7 @@ from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import GuardedDrive, Rights, Words, guardian
 from hil.runtime.header import header_of, log_path
-from hil.runtime.inbox import Inbox, ranges
+from hil.runtime.inbox import Inbox, Place, Takes, ranges
 from hil.runtime.loop import Loop, Outcome, Plan, StopRequest, no_whole
 from hil.runtime.progress import say, watching
 from hil.runtime.refusals import check_arming, check_load, check_reachable, check_set_up, needed_bytes
@@ -181,7 +181,7 @@ def _recorded(
         machine = machine if request.ramps else machine.at_once()
         alone = watch is not None or clock.name != "monotonic"
         takes = set_by_others(setup)
-        with contextlib.closing(Inbox(machine, takes)) as inbox, _started(None if watch else client):
+        with contextlib.closing(Inbox(Place(machine, takes))) as inbox, _started(None if watch else client):
             compiled = partial(fused.whole_tick, client, words, machine, recorder, plan, request)
             whole = no_whole if alone else partial(compiled, number=inbox.number)
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
@@ -203,7 +203,7 @@ def _started(client: BusDrive | None) -> Iterator[None]:
         client.leave()
 
 
-def set_by_others(setup: Setup) -> dict[str, tuple[float, float, float]]:
+def set_by_others(setup: Setup) -> Takes:
     """What ``hil set`` may ask of this run: nothing when the config says so, or when it sends nothing."""
     config = setup.config
     if config.loop.shadow or not config.setpoint.enabled:
@@ -256,7 +256,7 @@ def _run_armed(
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
-    takes: dict[str, tuple[float, float, float]],
+    takes: Takes,
     client: BusDrive,
 ) -> RunResult:
     grants: list[realtime.Grant] = []
@@ -299,10 +299,13 @@ def driving(
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
-    takes: dict[str, tuple[float, float, float]],
-    nodes: tuple[str, ...] = (),
+    takes: Takes,
+    nodes: Mapping[str, Takes] | None = None,
 ) -> Iterator[list[realtime.Grant]]:
-    """While the loop runs: signals stop it, the rights asked for are granted, others see it."""
+    """While the loop runs: signals stop it, the rights asked for are granted, others see it.
+
+    ``nodes``: of a run with several nodes what may be set of each, by name.
+    """
     ticks, where = plan_of(config).ticks, f"{config.bus.interface}:{config.bus.channel}"
     with stopping_on_signals(request):
         note_interface(config, recorder, clock.now_ns(), 0)
@@ -310,7 +313,7 @@ def driving(
         if clock.name == "monotonic":
             realtime.keep_off(recorder.writer_pid, config.realtime.cpu)
             grants = realtime.acquire(config.realtime)
-        entry = own_entry(recorder.path, where, config.loop.rate_hz, ticks, clock.name, takes, nodes)
+        entry = own_entry(recorder.path, where, config.loop.rate_hz, ticks, clock.name, takes, nodes or {})
         with announced(entry), watching(os.getpid(), ticks):
             yield grants
 

@@ -13,9 +13,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.runtime.registry import WatchError, matching
+from hil.runtime.registry import WatchError, matching, no_node
 from hil.signals import FIELDS, Field, TickArray
-from hil.watch.look import Look, figures, no_node, outcome
+from hil.watch.look import Look, figures, outcome
 
 BINS_PER_S: Final = 100
 CURVES: Final = tuple(field for field in FIELDS if field.shown.live)

@@ -14,7 +14,7 @@ from hil.log.records import EVENT, EVENT_BYTES
 from hil.log.ring import RingError, attach
 from hil.runtime.clock import RealClock
 from hil.runtime.inbox import SetpointError, ask, outside, shown
-from hil.runtime.registry import Entry, WatchError, ask_stop, is_alive
+from hil.runtime.registry import Entry, WatchError, ask_stop, is_alive, no_node
 from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
 
 SILENT_S, SILENT_PERIODS = 0.3, 3
@@ -35,17 +35,9 @@ def unpack_events(raw: bytes) -> list[Event]:
     return found
 
 
-def no_node(entry: Entry, node: str) -> str:
-    """Why a run has no such node; empty where it has, and for none named."""
-    if not node or node in entry.nodes:
-        return ""
-    known = f"it has {' and '.join(entry.nodes)}" if entry.nodes else "it is of one drive: leave the node out"
-    return f"{entry} has no node {node!r:.40}; {known}"
-
-
 def ring_of(entry: Entry, node: str) -> str:
     """What the ring of a node's ticks is called."""
-    place = entry.nodes.index(node) if node else 0
+    place = entry.place_of(node)
     return f"ticks-{place}" if place else "ticks"
 
 
@@ -123,15 +115,15 @@ class Look:
 
     @property
     def takes(self) -> dict[str, tuple[float, float, float]]:
-        """What may be set of what is seen: set-points are the first node's."""
-        return self.entry.takes if self.node in ("", *self.entry.nodes[:1]) else {}
+        """What may be set of what is seen."""
+        return self.entry.takes_of(self.node)
 
     def set(self, values: dict[str, float], who: str) -> str:
         """Ask for other references; say in a few words what came of it."""
         if why := outside(values, self.takes):
             return f"refused: {why}"
         try:
-            ask(self.entry.pid, values, who, timeout_s=0.5)
+            ask(self.entry.pid, values, who, timeout_s=0.5, node=self.entry.place_of(self.node))
         except SetpointError as error:
             return f"refused: {error}"
         return f"set: {shown(values)}"

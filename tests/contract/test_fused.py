@@ -43,7 +43,7 @@ from hil.runtime.guardian import (
     Words,
 )
 from hil.runtime.header import header_of
-from hil.runtime.inbox import Inbox, ranges
+from hil.runtime.inbox import Inbox, Place, ranges
 from hil.runtime.loop import (
     BEGUN,
     DECIDED,
@@ -486,7 +486,7 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         guarded, record = GuardedDrive(client, words, time.monotonic_ns, sync), recorder.record
         whole = counted if compiled else no_whole
         parts = guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole
-        page = Inbox(machine, ranges(machine, "cascade"))
+        page = Inbox(Place(machine, ranges(machine, "cascade")))
         loop = Loop(*parts, page, sync)
         drive.operator, drive.inbox, drive.recorder = request, page, recorder
         TIME.restart()  # kernels that were compiled meanwhile have waited

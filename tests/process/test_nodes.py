@@ -15,12 +15,15 @@ import can
 import numpy as np
 import pytest
 
+from hil.cli import main
 from hil.log.errors import LogError
 from hil.log.reader import Log, open_log
+from hil.replay import replay
 from hil.runtime.setup import Overrides
 from hil.signals import Controlword, DriveState, Reason, Request
 from hil.sim.demo import emulator_process
 from tests.process.test_run import call, flags, hil
+from tests.process.test_set import wait_for_operation
 
 pytestmark = pytest.mark.process
 Settings = Callable[..., tuple[str, ...]]
@@ -99,6 +102,53 @@ def test_a_fault_of_one_stops_all(configs: Path, settings: Settings, faulty: int
     assert [(frame.can_id, frame.data) for frame in sent] == [(SYNC, b""), (MOTOR, OFF[0]), (LOAD, OFF[0])]
     assert {int(log.ticks["state"][-1]) for log in logs} <= {DriveState.FAULT, DriveState.SWITCH_ON_DISABLED}
     assert open_log(Path(result["log"]), node=names[other]).result["ended"] == "node_stopped"
+
+
+def test_the_second_node_s_reference_is_set_while_it_runs(
+    configs: Path, settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The motor as the file's second entry: its reference moves, in its own ticks alone, and replays."""
+    text = (configs / "dyno.toml").read_text(encoding="utf-8")
+    head, motor, load = text.split("[[drive]]")
+    path = configs / "swapped.toml"
+    path.write_text("[[drive]]".join((head, load, motor)), encoding="utf-8")
+    own = settings(
+        "loop.rate_hz=200", "loop.duration_s=120.0", "drive.0.controller.for_s=[100.0,0.1,0.1]",
+        "drive.1.reference.down_at_s=100.0", "drive.1.setpoint.rate_rad_s2=100.0",
+        *(f"drive.{node}.canopen.rpdo_timeout_ms=60000" for node in (0, 1)),
+    )  # fmt: skip
+    with emulator_process(path, Overrides(settings=own)):
+        for name in ("load", "motor"):
+            done = call("configure", str(path), *flags((*own, f'node="{name}"')))
+            assert done.returncode == 0, done.stdout + done.stderr
+        with hil("run", str(path), *flags(own)) as run:
+            wait_for_operation(run)
+            done = call("set", "w=40", str(run.pid), "--node", "motor", "--json")
+            assert done.returncode == 0, done.stderr
+            told = json.loads(done.stdout)
+            assert (told["node"], told["set"], told["rate"]) == ("motor", {"w": 40.0}, {"w": 100.0})
+            for words, said in (
+                (["w=1", "--node", "brake"], "has no node 'brake'; it has load and motor; nothing was set"),
+                (["w=400", "--node", "motor"], "node motor of PID"),
+                (["w=1", "--node", "load"], "this run takes no set-point"),
+                (["w=1"], "this run takes no set-point"),
+            ):
+                assert main(["set", *words, "--run", str(run.pid)]) == 2
+                refused = capsys.readouterr().err
+                assert said in refused and len(refused.splitlines()) == 1, refused
+            time.sleep(1.5)
+            run.send_signal(signal.SIGINT)
+            run.communicate(timeout=60)
+            assert run.returncode == 0
+    (log_path,) = tmp_path.rglob("*.mcap")
+    motor_log, load_log = open_log(log_path, node="motor"), open_log(log_path)
+    assert (motor_log.ticks["w_ref"] == 40.0).sum() > 100 and (load_log.ticks["w_ref"] == 0.0).all()
+    assert np.abs(motor_log.ticks["w"] - 40.0).min() < 0.5
+    set_points = [event["text"] for event in load_log.events if event["kind"] == "set-point"]
+    assert len(set_points) == 1 and set_points[0].startswith("motor: w = 40 rad/s: taken, asked by hil set")
+    assert {name: one.verdict for name, one in replay(log_path).nodes.items()} == {
+        "load": "same", "motor": "same"
+    }  # fmt: skip
 
 
 def test_the_guardian_stops_both(configs: Path, settings: Settings, channel: str) -> None:
