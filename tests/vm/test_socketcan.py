@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from socket import CAN_EFF_MASK
 from typing import Any
 
 import numpy as np
@@ -283,6 +285,39 @@ def test_a_few_bad_frames_and_a_flood_are_ridden_through(socketcan: Path) -> Non
     flags = np.bitwise_or.reduce(run.log.ticks["rx_flags"])
     assert flags & RxFlag.CRC_ERROR and flags & RxFlag.LENGTH_ERROR
     assert replay_log(run.log).verdict == "same"
+
+
+@pytest.mark.parametrize(
+    ("name", "measured"),
+    [("shadow", ("echo", "w", "i_q", "i_d")), ("shadow_of_other_drive", ("w", "i_q", "i_d"))],
+)
+def test_a_shadow_sends_nothing_and_computes_what_the_controller_computes(
+    socketcan: Path, name: str, measured: tuple[str, ...]
+) -> None:
+    run = seen(socketcan, name)
+    assert run.result["returncode"] == 0 and (run.folder / "shadow.txt").read_text() == "0"
+    shadow = open_log(next((run.folder / "shadow").glob("*.mcap")))
+    assert replay_log(shadow).verdict == "same" and replay_log(run.log).verdict == "same"
+    assert not shadow.ticks["send"].any() and all(frame.received for frame in shadow.frames)
+    own = Counter(frame.can_id & CAN_EFF_MASK for frame in run.log.frames if not frame.received)
+    on_bus = Counter(can_id for can_id, _ in run.frames)
+    assert own and {can_id: on_bus[can_id] for can_id in own} == own, "a third one sent something"
+    driven = shadow.ticks[shadow.ticks["state"] == DriveState.OPERATION_ENABLED][MEMORY:]
+    assert len(driven) >= 900
+    mine, ticks = rows_of(driven, measured), rows_of(run.log.ticks, measured)
+    starts = [i for i in range(len(ticks)) if ticks[i : i + len(mine)] == mine]
+    assert len(starts) == 1, "the shadow has every frame that the controller has"
+    its = run.log.ticks[starts[0] :][: len(mine)]
+    for what in ("d_hat_w", "d_hat_q", "d_hat_d"):
+        assert np.abs(driven[what] - its[what]).max() < 1e-9, what
+
+
+MEMORY = 100
+"""Ticks after which the observers know nothing of what was before the shadow came."""
+
+
+def rows_of(ticks: np.ndarray, names: tuple[str, ...]) -> list[tuple[float, ...]]:
+    return list(zip(*[ticks[name].tolist() for name in names], strict=True))
 
 
 def events_of(run: Seen, kind: str) -> str:

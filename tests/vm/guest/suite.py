@@ -201,14 +201,16 @@ def injected_beyond_the_budget() -> None:
 
 
 def stale_counter_ridden_through() -> None:
-    """Feedback of before, whole and with a valid CRC: its counter tells that it is old."""
+    """Feedback of eight ticks before, whole, its CRC valid: its counter, of 16, tells that it is old."""
     with Scenario("stale_counter_ridden_through", seconds=4.0) as s:
         s.start()
         s.running()
-        for _ in range(3):
-            old = next(line for line in s.dump.read_text().splitlines() if " 181#" in line).split()[2]
-            sh("cansend", "vcan0", old)
-            time.sleep(0.1)
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as own:
+            own.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, struct.pack("=II", 0x181, 0x7FF))
+            own.bind(("vcan0",))
+            for _ in range(3):
+                feedback = [own.recv(16) for _ in range(9)]
+                own.send(feedback[0])
 
 
 def stale_counters_beyond_the_budget() -> None:
@@ -302,6 +304,22 @@ def vcan_other_drive() -> None:
     """Big endian, extended identifiers, CAN FD, no SYNC: by configuration alone."""
     with Scenario("vcan_other_drive", config="configs/inverter.toml") as s:
         s.start()
+
+
+def shadow(name: str = "shadow", config: str = CONFIG, command: str = " 201#") -> None:
+    """A shadow joins a running controller, sees what it sees, and leaves before it."""
+    with Scenario(name, config=config, seconds=3.0) as s:
+        s.start()
+        s.running(command)
+        own = ["--set", f'log.folder="{s.folder / "shadow"}"', "--set", "loop.duration_s=1.0"]
+        words = ("run", config, "-i", "socketcan", "-c", "vcan0", "--json", "--shadow", *own)
+        beside = Forked.hil(s.folder / "shadow.json", *words)
+        (s.folder / "shadow.txt").write_text(str(beside.wait()))
+
+
+def shadow_of_other_drive() -> None:
+    """Without an echo it takes the newest command that it saw for what is applied."""
+    shadow("shadow_of_other_drive", "configs/inverter.toml", " 18FF1100#")
 
 
 def other_drive_watchdog() -> None:
@@ -407,6 +425,8 @@ def main() -> int:
         kvaser_pair,
         vcan_fd,
         vcan_other_drive,
+        shadow,
+        shadow_of_other_drive,
         other_drive_watchdog,
         other_drive_is_late,
         by_hand,
