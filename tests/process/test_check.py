@@ -65,11 +65,12 @@ def test_a_sync_drive_is_ready_and_nothing_is_sent(configs: Path, settings: Sett
 
 
 def test_a_cyclic_drive_shows_everything(configs: Path, settings: Settings) -> None:
-    own = settings("drive.heartbeat_timeout_s=1.0", 'loop.pacing="feedback"')
+    """It listens for 5 s: the host may hold the emulator up for a tenth of that, then its rate is not 1 kHz."""
+    own = settings("drive.heartbeat_timeout_s=5.0", 'loop.pacing="feedback"')
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own), ('pacing="cyclic"',)):
         code, rows, _ = checked(path, own)
-    assert code == 0, rows
+    assert code == 0, [r for r in rows.values() if r["verdict"] == "fail"]
     for name in ("feedback rate", "frames", "protocol version", "speed and current", "supply and heat"):
         assert rows[name]["verdict"] == "pass", rows[name]
 
