@@ -65,7 +65,7 @@ def test_a_sync_drive_is_ready_and_nothing_is_sent(configs: Path, settings: Sett
 
 
 def test_a_cyclic_drive_shows_everything(configs: Path, settings: Settings) -> None:
-    """It listens for 5 s: a host that holds the emulator up for less than a tenth of that changes no verdict."""
+    """It listens for 5 s: if the host holds the emulator up for up to half a second, no verdict changes."""
     own = settings("drive.heartbeat_timeout_s=5.0", 'loop.pacing="feedback"')
     path = configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own), ('pacing="cyclic"',)):
