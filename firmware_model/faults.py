@@ -21,6 +21,8 @@ class FaultTable(Table):
     """When it begins [plant time]."""
     for_s: Span | None = None
     """How long it lasts; left out: for good."""
+    node: str | None = None
+    """Of several nodes the one that it happens to; left out: each whose plant has it."""
 
     def active(self, t_ns: int) -> bool:
         """True while the fault is there; both ends are exact nanoseconds."""
@@ -80,7 +82,10 @@ class FrozenCounter(FrameFault):
 
 
 class BusOff(FaultTable):
-    """The controllers fall off the bus: an error frame says so, then nothing passes in either direction."""
+    """The controllers fall off the bus: an error frame says so, then nothing passes in either direction.
+
+    On a bus of several nodes it is the node's own controller alone: silent and deaf, which nobody says.
+    """
 
     kind: Literal["bus-off"]
 

@@ -197,12 +197,16 @@ class Node:
         self._cells[LAST_NS] = now_ns
 
     def _advance(self, dt_ns: int) -> None:
-        """Move the plant on; a drive whose supply came back boots."""
+        """Move the plant on, then what its faults do."""
         if self._faults is None:
             self._kernels.advance(dt_ns)
-            return
-        self._faults.advance(self.state, dt_ns)
-        if self._faults.before(self.state):
+        else:
+            self._faults.advance(self.state, dt_ns)
+            self._fail(self._faults)
+
+    def _fail(self, faults: PlantFaults) -> None:
+        """What faults do to the plant before it is sampled; a drive whose supply came back boots."""
+        if faults.before(self.state):
             self._frames = self._make_frames()
             self._send(self._frames.boot())
 

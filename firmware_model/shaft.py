@@ -4,7 +4,7 @@ Both drives keep their own firmware, currents and loads; the shaft is advanced b
 joint right side (:mod:`firmware_model.motor`), of which both torques are part coefficient by coefficient:
     (J_1 + J_2) dw/dt = T_1 + T_2 - T_L1 - T_L2 - (B_1 + B_2) w
 A positive torque of either accelerates: a load machine that brakes a positive speed is commanded a negative
-one. Dry friction and a DC link that moves are left to a shaft of one motor.
+one. Dry friction, an open phase and a DC link that moves are left to a shaft of one motor.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ def refuse_uncoupled(plants: dict[str, PlantConfig]) -> None:
             "motor.L_q_saturation_a": plant.motor.L_q_saturation_a is not None,
             "a load that only holds (brake)": any(load.kind == "brake" for load in plant.load),
             "inverter.capacitance_f": bool(plant.inverter.capacitance_f),
-            "fault": bool(plant.fault),
-            "black_box": plant.black_box,
+            "fault: phase-loss": any(fault.kind == "phase-loss" for fault in plant.fault),
             'pacing = "cyclic"': plant.pacing != "sync",
         }
         for what in (what for what, there in has.items() if there):

@@ -10,6 +10,7 @@ import contextlib
 import ctypes
 import fcntl
 import json
+import math
 import multiprocessing
 import os
 import resource
@@ -30,16 +31,18 @@ from drivers.errors import DriverError
 from drivers.mapping import COMMANDED_D, COMMANDED_Q
 from firmware_model.node import BLACK_BOX
 from hil.errors import ConfigError, HilError
-from hil.faults.judge import Evidence, Result, judge
+from hil.faults.judge import Evidence, Result, judge, judge_together
 from hil.faults.matrix import ClockStep, DiskFull, InterfaceDown, Matrix, Row, Stall, WriterKilled
 from hil.log.reader import open_log
-from hil.replay import replay_log
+from hil.replay import replay
 from hil.runtime.bus import bus_settings
+from hil.runtime.nodesession import run_nodes
+from hil.runtime.nodesetup import Nodes, load_node_setups
 from hil.runtime.session import run
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import DriveState
 from hil.sim.demo import set_up
-from hil.sim.emulate import load_plant, serve
+from hil.sim.emulate import load_plants, serve
 
 RUN_TIMEOUT_S: Final = 60.0
 SAYS_NOTHING_S: Final = 20.0
@@ -99,11 +102,16 @@ def _redirected(write: int, errors: Path, target: Callable[..., None], args: tup
     sys.stdout.flush()
 
 
-def _control(setup: Setup, host: Any) -> None:
+def setups_of(path: Path, overrides: Overrides) -> Nodes:
+    """Each node's set-up by its name; that of one drive alone by no name. Raises ConfigError."""
+    return load_node_setups(path, overrides) or {"": load_setup(path, overrides)}
+
+
+def _control(setups: Nodes, host: Any) -> None:
     """The controller's process."""
     stepped = _step_wall_clock(host) if isinstance(host, ClockStep) else lambda: False
     try:
-        outcome = run(setup).outcome
+        outcome = (run(setups[""]) if "" in setups else run_nodes(setups)).outcome
     except (HilError, DriverError) as error:
         os.write(2, f"{error}\n".encode())
         raise SystemExit(2) from error
@@ -165,13 +173,12 @@ def emulator(
             process.wait(10.0)
 
 
-def black_box(said: list[str]) -> dict[str, Any]:
-    """The drive's own record of what was at the motor."""
-    for line in said:
-        if line.startswith(BLACK_BOX):
-            found: dict[str, Any] = json.loads(line.removeprefix(BLACK_BOX))
-            return found
-    raise HilError("the emulator left no black box")
+def black_boxes(said: list[str], count: int) -> list[dict[str, Any]]:
+    """Each drive's own record of what was at its motor."""
+    found = [json.loads(line.removeprefix(BLACK_BOX)) for line in said if line.startswith(BLACK_BOX)]
+    if len(found) != count:
+        raise HilError(f"the emulator left {len(found)} black boxes of {count}")
+    return found
 
 
 def wait_for_operation(setup: Setup, timeout_s: float = 30.0) -> int:
@@ -248,11 +255,13 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
         f"log.folder={json.dumps(str(folder))}",
     )
     overrides = Overrides(settings=(*matrix.settings(row), *own, 'log.name="run"'))
-    setup, onset_ns, acted = load_setup(path, overrides), None, True
+    setups, onset_ns, acted = setups_of(path, overrides), None, True
+    setup = next(iter(setups.values()))
     with emulator(path, overrides, matrix.plant_settings(row), folder / "emulator.txt") as said:
-        if setup.config.canopen is not None:
-            set_up(path, setup.config)
-        controller = Forked(folder / "controller.txt", _control, setup, row.host)
+        for one in setups.values():
+            if one.config.canopen is not None:
+                set_up(path, one.config)
+        controller = Forked(folder / "controller.txt", _control, setups, row.host)
         try:
             if row.host is not None:
                 onset_ns, acted = inject(row.host, controller, setup, lambda: folder / "run.mcap")
@@ -271,31 +280,56 @@ def _run(path: Path, matrix: Matrix, row: Row, folder: Path, result: Result) -> 
     onset_s = row.onset_s
     if onset_ns is not None and len(log.ticks):
         onset_s = (onset_ns - int(log.ticks["t_ns"][0])) * 1e-9
-    command = setup.binding.command
-    reader = command.message.reader(*(n for part, n in command.parts if part in (*COMMANDED_Q, *COMMANDED_D)))
     reason = int(ended) if ended.isdecimal() else None
-    evidence = Evidence(log, black_box(said), reason, onset_s, row.host, acted, setup.binding.map.poll != "")
-    judge(result, row.expect, evidence, setup.config.command.most, reader, command.message.send_id)
-    verdict = replay_log(log)
+    judged = {}
+    for (name, one), box in zip(setups.items(), black_boxes(said, len(setups)), strict=True):
+        seen = open_log(log.path, node=name) if name else log
+        evidence = Evidence(seen, box, reason, onset_s, row.host, acted, one.binding.map.poll != "")
+        judged[name] = _judged(row, one, name, evidence)
+    judge_together(result, judged, row.expect.node)
+    verdict = replay(log.path)
     result.replay = verdict.verdict
     if verdict.verdict != "same":
         result.why.append(f"replay: {verdict.verdict} {verdict.why}".strip())
 
 
-def check_rows(path: Path, matrix: Matrix, rows: list[Row]) -> Setup:
+def _judged(row: Row, setup: Setup, name: str, evidence: Evidence) -> Result:
+    """One node's part of a row."""
+    result, command = Result(row.name, row.expect.text), setup.binding.command
+    reader = command.message.reader(*(n for part, n in command.parts if part in (*COMMANDED_Q, *COMMANDED_D)))
+    expect = row.expect.of(name) if name else row.expect
+    if setup.config.controller.kind == "torque":  # it follows no speed
+        expect = expect.model_copy(update={"w_error_rad_s": math.inf})
+    judge(result, expect, evidence, setup.config.command.most, reader, command.message.send_id)
+    return result
+
+
+def check_rows(path: Path, matrix: Matrix, rows: list[Row]) -> Nodes:
     """Load every row's configurations; raises ConfigError with all mistakes of all rows."""
     problems: list[str] = []
-    setup = None
+    setups: Nodes = {}
     for row in rows:
         try:
-            setup = load_setup(path, Overrides(settings=matrix.settings(row)))
-            plant, _ = load_plant(path, setup.config, matrix.plant_settings(row))
-            for fault in plant.fault:
-                if message := getattr(fault, "message", ""):
-                    setup.database.message(message)
+            setups = setups_of(path, Overrides(settings=matrix.settings(row)))
+            problems += [f"row {row.name!r}: {problem}" for problem in _no_node(row, setups)]
+            configs = {name: setup.config for name, setup in setups.items()}
+            for name, (plant, _) in load_plants(path, configs, matrix.plant_settings(row)).items():
+                for fault in plant.fault:
+                    if message := getattr(fault, "message", ""):
+                        setups[name].database.message(message)
         except (HilError, DriverError) as error:
             found = error.problems if isinstance(error, ConfigError) else [str(error)]
             problems += [f"row {row.name!r}: {problem}" for problem in found]
-    if problems or setup is None:
+    if problems or not setups:
         raise ConfigError(str(path), problems)
-    return setup
+    return setups
+
+
+def _no_node(row: Row, setups: Nodes) -> list[str]:
+    """What is wrong with the node that a row expects to stop."""
+    node, known = row.expect.node, " and ".join(setups)
+    if node is not None and node not in setups:
+        return [f"expect.node: {node!r}: " + (f"there are {known}" if known else "the bus has one drive")]
+    if node is None and row.expect.reaction == "stop" and known:
+        return [f"expect.node: missing; which of {known} stops for that reason?"]
+    return []

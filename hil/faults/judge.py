@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -108,6 +108,24 @@ def judge(
     _judge_limits(result, expect, u_max)
     _judge_log(result, expect, log)
     _judge_frames(result, log, command_id, read_command, evidence.asked)
+
+
+def judge_together(result: Result, judged: Mapping[str, Result], cause: str | None) -> None:
+    """What is true of all nodes of a run, into ``result``; the reaction is that of ``cause``.
+
+    Of several nodes all stop in the same tick.
+    """
+    first = judged[cause] if cause else next(iter(judged.values()))
+    for name in ("reaction", "log", "onset_s", "stop_s", "traces"):
+        setattr(result, name, getattr(first, name))
+    for name in ("w_worst_rad_s", "i_worst_a", "u_worst_v"):
+        setattr(result, name, max(getattr(one, name) for one in judged.values()))
+    safe_ms = [one.time_to_safe_ms for one in judged.values() if one.time_to_safe_ms is not None]
+    result.time_to_safe_ms = max(safe_ms, default=None)
+    for name, one in judged.items():
+        result.why += [f"{name}: {why}" if name else why for why in one.why]
+        if one.stop_s != first.stop_s:
+            result.why.append(f"{name}: did not stop in the same tick")
 
 
 def _judge_stop(

@@ -92,6 +92,8 @@ class Expect(Table):
     """Largest true current from the fault on; left out: not judged."""
     log: Literal["complete", "readable"] = "complete"
     """The log is whole, or can at least be read."""
+    node: str | None = None
+    """Of several nodes the one that stops for this reason; every other one stops with it as node_stopped."""
 
     @field_validator("reason")
     @classmethod
@@ -116,7 +118,13 @@ class Expect(Table):
         """As the table shows it."""
         if self.reaction == "ride through":
             return self.reaction
-        return f"stop: {' or '.join(self.reason)} within {self.within_ms:g} ms"
+        of = f"{self.node} " if self.node else ""
+        return f"stop: {of}{' or '.join(self.reason)} within {self.within_ms:g} ms"
+
+    def of(self, node: str) -> Expect:
+        """What must come of it at one of several nodes."""
+        other = self.reaction == "stop" and node != self.node
+        return self.model_copy(update={"reason": ["node_stopped"]}) if other else self
 
 
 class Row(Table):

@@ -32,10 +32,11 @@ def study(
     path: Path, matrix: Matrix, rows: list[Row], folder: Path, jobs: int, done: Callable[[Result], None]
 ) -> list[Result]:
     """Run rows; those in real time one after the other once the machine is free of the others."""
-    setup = check_rows(path, matrix, rows)
-    setup.machine.warm_up()
-    compile_kernels(setup)  # here once: a row's own time is no time to compile in
-    warm_up(path, setup.config)
+    setups = check_rows(path, matrix, rows).values()
+    for setup in setups:
+        setup.machine.warm_up()
+        compile_kernels(setup)  # here once: a row's own time is no time to compile in
+    warm_up(path, *(setup.config for setup in setups))
     results: dict[str, Result] = {}
     for realtime, side_by_side in ((False, jobs), (True, 1)):
         part = [row for row in rows if row.realtime == realtime]

@@ -10,12 +10,12 @@ from drivers.binding import bind
 from drivers.bus import Link, open_link
 from drivers.codec import Database
 from drivers.mapping import MEASURED
-from firmware_model.bench import Bench, Coupled
+from firmware_model.bench import Bench, Coupled, Tap
 from firmware_model.config import PlantConfig, build_params, new_state
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults
 from firmware_model.node import Node, compile_kernels, frames_of, wire_of
-from firmware_model.shaft import refuse_uncoupled
+from firmware_model.shaft import Shaft, refuse_uncoupled
 from hil.config.nodefile import load_nodes
 from hil.config.tables import RunConfig, load_toml
 from hil.errors import ConfigError
@@ -35,7 +35,7 @@ def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None)
 
 def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple[Node, Link, str]:
     """Load everything, open the bus; return the node and a line that says what it is."""
-    plant, folder = load_plant(path, config, plant_settings)
+    plant, folder = load_plants(path, {"": config}, plant_settings)[""]
     database = Database(folder / plant.dbc, plant.node_id, config.drive.node_rule)
     params = build_params(plant, wire_of(database, plant.protocol))
     link: Link = open_link(bus_settings(config))
@@ -75,7 +75,7 @@ def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple
 
 def make_bench(path: Path, nodes: dict[str, RunConfig], plant_settings: list[str]) -> tuple[Bench, Link, str]:
     """:func:`make_node` for two drives on one shaft; the settings of a plant are for both."""
-    plants = {name: load_plant(path, config, plant_settings) for name, config in nodes.items()}
+    plants = load_plants(path, nodes, plant_settings)
     refuse_uncoupled({name: plant for name, (plant, _) in plants.items()})
     config = next(iter(nodes.values()))
     made, bus, link = [], config.bus, open_link(bus_settings(config))
@@ -87,23 +87,58 @@ def make_bench(path: Path, nodes: dict[str, RunConfig], plant_settings: list[str
                 f"{path}: node {name}",
                 [f"emulator.plant: node {plant.node_id} is emulated, drive.node_id is {own.node_id}"],
             )
-        database = Database(folder / plant.dbc, plant.node_id, own.node_rule)
-        made.append(
-            Coupled(
-                link,
-                database,
-                build_params(plant, wire_of(database, plant.protocol)),
-                clock=config.loop.clock,
-                pacing="sync",
-                period_ns=config.loop.period_ns,
-                truth=plant.truth,
-                protocol=plant.protocol,
-                eds=folder / plant.eds if plant.eds else None,
-            )
-        )
+        made.append(_coupled(plant, folder, link, config, own.node_rule))
     shown = " and ".join(f"{name} (node {plant.node_id})" for name, (plant, _) in plants.items())
     what = f"{bus.interface}:{bus.channel}, {shown} on one shaft, {config.loop.clock}"
     return Bench(link, made), link, what
+
+
+def load_plants(
+    path: Path, nodes: dict[str, RunConfig], settings: list[str] | None = None
+) -> dict[str, tuple[PlantConfig, Path]]:
+    """:func:`load_plant` for each node, with the faults that happen to it; one drive alone has no name.
+
+    Raises ConfigError.
+    """
+    plants = {}
+    for name, config in nodes.items():
+        plant, folder = load_plant(path, config, settings)
+        for fault in plant.fault:
+            if fault.node is not None and fault.node not in nodes:
+                known = " and ".join(nodes)
+                why = f"there are {known}" if known else "the bus has one drive; leave the node out"
+                raise ConfigError(str(path), [f"fault: node {fault.node!r}: {why}"])
+        own = [fault for fault in plant.fault if fault.node in (None, name)]
+        plants[name] = plant.model_copy(update={"fault": own}), folder
+    return plants
+
+
+def _coupled(plant: PlantConfig, folder: Path, link: Link, config: RunConfig, node_rule: str) -> Coupled:
+    """One node of a bench, with its faults."""
+    database = Database(folder / plant.dbc, plant.node_id, node_rule)
+    params = build_params(plant, wire_of(database, plant.protocol))
+    eds = folder / plant.eds if plant.eds else None
+    faulty, faults, acted, tap = None, None, Counter[int](), Tap(link)
+    if plant.fault or plant.black_box:
+        frames = frames_of(database, plant.protocol, eds=(eds, {}) if eds else None)
+        faults = PlantFaults(plant.fault, params, frames.counter_modulus - 1, acted)
+        faulty = FaultyLink(tap, database, plant.fault, lockstep=False, acted=acted, sync_id=frames.sync_id)
+    node = Coupled(
+        faulty or link,
+        database,
+        params,
+        clock=config.loop.clock,
+        pacing="sync",
+        period_ns=config.loop.period_ns,
+        truth=plant.truth,
+        protocol=plant.protocol,
+        eds=eds,
+        faults=faults,
+    )
+    if faulty is not None:
+        faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
+        node.faulty, node.tap = faulty, tap
+    return node
 
 
 def check_spoken(path: Path, config: RunConfig, spoken: dict[int, int]) -> None:
@@ -130,11 +165,16 @@ def check_spoken(path: Path, config: RunConfig, spoken: dict[int, int]) -> None:
         )
 
 
-def warm_up(path: Path, config: RunConfig) -> None:
-    """Compile the plant's kernels and those of its faults, for the processes forked from this one."""
-    plant, folder = load_plant(path, config)
-    params = build_params(plant, wire_of(Database(folder / plant.dbc, plant.node_id), plant.protocol))
-    compile_kernels(params, new_state(params, 0))
+def warm_up(path: Path, *configs: RunConfig) -> None:
+    """Compile the plants' kernels and those of their faults, for the processes forked from this one."""
+    records = []
+    for config in configs:
+        plant, folder = load_plant(path, config)
+        params = build_params(plant, wire_of(Database(folder / plant.dbc, plant.node_id), plant.protocol))
+        records += [params, new_state(params, 0)]
+    compile_kernels(*records[:2])
+    if len(configs) == 2:
+        Shaft(*records)
 
 
 def serve(path: Path, overrides: Overrides, plant_settings: list[str]) -> None:

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from hil.config.tables import load_toml
+from hil.errors import ConfigError
 from hil.faults.case import check_rows, run_row
-from hil.faults.matrix import ClockStep, Matrix, load_matrix
+from hil.faults.matrix import ClockStep, Matrix, Row, load_matrix
 from hil.log.reader import open_log
-from hil.signals import FIELDS
+from hil.signals import FIELDS, Reason
 from tests.conftest import CONFIGS
 
 pytestmark = pytest.mark.process
@@ -60,6 +61,72 @@ def test_rows_of_drives_by_others(
     assert code == 0, rows
     found = [row["time_to_safe_ms"] for row in rows]
     assert [one if one is None else round(one) for one in found] == safe_ms
+
+
+def test_rows_of_two_nodes(tmp_path: Path) -> None:
+    """What happens to one stops the other in the same tick; both have their say in the row."""
+    path = CONFIGS / "faults/dyno.toml"
+    own, run_path = load_matrix(path, CONFIGS / "faults.toml")
+    assert list(check_rows(run_path, own, own.row)) == ["motor", "load"]
+    only = [
+        word for name in ("load's TPDO1", "bus-off of the motor", "EMCY lost") for word in ("--only", name)
+    ]
+    code, rows = run(path, tmp_path, *only)
+    assert code == 0, rows
+    assert [row["reaction"].removeprefix("stop: ") for row in rows] == [
+        "ride through", "ride through", "stale_feedback", "stale_feedback", "drive_fault",
+    ]  # fmt: skip
+    found = [row["time_to_safe_ms"] for row in rows]
+    assert [one if one is None else round(one) for one in found] == [None, None, 6, 19, 232]
+    motor, load = (open_log(Path(rows[2]["path"]), node=node) for node in ("motor", "load"))
+    firsts = [log.ticks[log.ticks["reason"] != 0][0] for log in (motor, load)]
+    assert [Reason(int(tick["reason"])).name for tick in firsts] == ["NODE_STOPPED", "STALE_FEEDBACK"]
+    assert firsts[0]["k"] == firsts[1]["k"] and {row["replay"] for row in rows} == {"same"}
+    sent = [f.can_id for f in motor.frames if not f.received and f.t_ns == int(firsts[0]["t_ns"])]
+    assert sent == [0x080, 0x205, 0x206], "SYNC, then the commands in the configuration's order"
+
+
+def test_a_row_that_expects_another_node_to_stop_fails(tmp_path: Path) -> None:
+    own, path = load_matrix(CONFIGS / "faults/dyno.toml", CONFIGS / "faults.toml")
+    row = next(row for row in own.row if row.name == "load's TPDO1: none any more")
+    row = row.model_copy(update={"expect": row.expect.model_copy(update={"node": "motor"})})
+    result = run_row(path, own, row, tmp_path / "run")
+    assert result.why == ["motor: reason node_stopped", "load: reason stale_feedback"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"fault": [{"kind": "drop", "at_s": 0.5, "message": "TPDO1", "node": "brake"}]},
+         "fault: node 'brake': there are motor and load"),
+        ({"fault": [{"kind": "drop", "at_s": 0.5, "message": "FEEDBACK", "node": "load"}]}, "FEEDBACK"),
+        ({"expect": {"reaction": "stop", "reason": ["over_speed"], "within_ms": 1.0}},
+         "expect.node: missing; which of motor and load stops for that reason?"),
+        ({"expect": {"reaction": "stop", "reason": ["over_speed"], "within_ms": 1.0, "node": "brake"}},
+         "expect.node: 'brake': there are motor and load"),
+    ],
+)  # fmt: skip
+def test_a_node_that_is_none_is_said(changed: dict[str, Any], said: str) -> None:
+    own, path = load_matrix(CONFIGS / "faults/dyno.toml", CONFIGS / "faults.toml")
+    row = Row.model_validate({"name": "odd", "expect": {"reaction": "ride through"}} | changed)
+    with pytest.raises(ConfigError, match=said) as caught:
+        check_rows(path, own, [row])
+    assert len(caught.value.problems) == 1 and "row 'odd': " in caught.value.problems[0]
+
+
+def test_of_one_drive_no_fault_names_a_node() -> None:
+    row = Row.model_validate(
+        {
+            "name": "odd",
+            "expect": {"reaction": "stop", "reason": ["over_speed"], "within_ms": 1.0, "node": "a"},
+        }
+    )
+    with pytest.raises(ConfigError, match=r"expect\.node: 'a': the bus has one drive"):
+        check_rows(CONFIGS / "demo.toml", matrix(), [row])
+    bad = row.model_copy(update={"expect": matrix().row[0].expect,
+                                 "fault": [{"kind": "bus-off", "at_s": 0.5, "node": "a"}]})  # fmt: skip
+    with pytest.raises(ConfigError, match="fault: node 'a': the bus has one drive; leave the node out"):
+        check_rows(CONFIGS / "demo.toml", matrix(), [bad])
 
 
 def test_rows_in_real_time(tmp_path: Path) -> None:

@@ -164,6 +164,28 @@ def test_frames_to_the_drive_have_faults_too_and_a_lost_sync_lets_time_pass() ->
     assert (over.can_id | over.flags, over.data) == (TICK_OVER, b"\x07")
 
 
+def test_once_a_tick_is_over_nobody_waits_for_more_of_it() -> None:
+    """Of two clients of one link the second has nothing to wait for either."""
+    waits: list[int] = []
+
+    class Timed(Ends):
+        def receive(self, timeout_ns: int) -> Frame | None:
+            waits.append(timeout_ns)
+            return super().receive(timeout_ns)
+
+    ends = Timed()
+    link = LockstepLink(ends, 0x80)
+    assert link.receive(7) is None and waits == [7]
+    link.send(0x80, b"")
+    can_id, data = tick_over(b"")
+    ends.waiting = [Frame(can_id & 0x1FFFFFFF, data, can_id & ~0x1FFFFFFF, False)]
+    assert link.receive(7) is None and link.receive(7) is None and waits == [7, 7, 0]
+    ends.waiting = [Frame(0x185, b"", 0, False)]
+    assert link.receive(7) == Frame(0x185, b"", 0, False), "what is there is read"
+    link.send(0x80, b"")
+    assert link.receive(7) is None and waits[-1] == 7
+
+
 def test_a_lockstep_link_ends_the_wait_with_its_own_tick_and_hides_it() -> None:
     ends = Ends()
     link = LockstepLink(ends, 0x80)

@@ -193,7 +193,7 @@ def test_equal_and_opposite_torques_hold_the_shaft() -> None:
     [
         ("friction.coulomb_n_m=0.1", "plant of load: friction: not on a shaft of two motors; remove it"),
         ("inverter.capacitance_f=1e-3", "plant of load: inverter.capacitance_f"),
-        ("black_box=true", "plant of load: black_box"),
+        ('fault=[{kind="phase-loss",at_s=0.1}]', "plant of load: fault: phase-loss"),
         ('load=[{kind="brake",torque_n_m=1.0,at_s=0.0}]', "plant of load: a load that only holds"),
     ],
 )
