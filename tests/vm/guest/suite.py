@@ -6,6 +6,7 @@ the tests on the host side, so that one boot serves them all.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from hil import cli
 from tests.vm.guest import IN_MACHINE
 from tests.vm.guest import instructions as counted
 from tests.vm.guest.process import CONFIG, FD, KERNEL, SCRATCH, Forked, warm_up
@@ -61,11 +63,16 @@ class Scenario:
         own = [word for one in self.settings for word in ("--set", one)]
         return ["-i", "socketcan", "-c", channel, *own]
 
-    def start(self) -> None:
+    def start(self, before: Callable[[], None] = lambda: None) -> None:
         folder = ["--set", f'log.folder="{self.folder}"', "--set", f"loop.duration_s={self.seconds}"]
         arm = [] if self.controller.startswith("vcan") else ["--arm", "--yes"]
         words = ("run", self.config, *self._bus(self.controller), "--json", *arm, *folder)
-        self.run = Forked.hil(self.folder / "run.json", *words)
+
+        def job() -> int:
+            before()
+            return cli.main(list(words))
+
+        self.run = Forked(self.folder / "run.json", job)
 
     def running(self, command: str = " 201#") -> None:
         """Wait until commands are on the bus and the drive has been in operation for a while."""
@@ -89,10 +96,27 @@ def vcan_two_processes() -> None:
         s.start()
 
 
-def vcan_5_khz() -> None:
-    settings = ("loop.rate_hz=5000", "loop.feedback_timeout_us=160")
-    with Scenario("vcan_5_khz", seconds=0.6, settings=settings) as s:
+def vcan_8_khz() -> None:
+    settings = ("loop.rate_hz=8000", "loop.feedback_timeout_us=100")
+    with Scenario("vcan_8_khz", seconds=0.4, settings=settings) as s:
         s.start()
+
+
+def vcan_without_fifo() -> None:
+    """The controller is root, but may not ask for a real-time priority."""
+    with Scenario("vcan_without_fifo") as s:
+        s.start(before=drop_sys_nice)
+
+
+def drop_sys_nice() -> None:
+    """Give up CAP_SYS_NICE for good, so that SCHED_FIFO is denied as it is to an ordinary user."""
+    libc, cap_sys_nice = ctypes.CDLL(None, use_errno=True), 23
+    head, sets = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()  # version 3, this process
+    libc.capget(head, sets)
+    for word in range(3):  # effective, permitted, inheritable of the first 32
+        sets[word] &= ~(1 << cap_sys_nice)
+    if libc.capset(head, sets) != 0:
+        raise OSError(ctypes.get_errno(), "capabilities can't be changed")
 
 
 def vcan_kernel_sync() -> None:
@@ -417,7 +441,8 @@ def main() -> int:
     scenarios: list[Callable[[], None]] = [
         rehearsal,
         vcan_two_processes,
-        vcan_5_khz,
+        vcan_8_khz,
+        vcan_without_fifo,
         vcan_kernel_sync,
         kernel_sync_ends_with_its_process,
         kernel_sync_of_a_stopped_process,
