@@ -210,7 +210,7 @@ def cmd_design(args: argparse.Namespace) -> int:
     path.write_text(found["toml"], encoding="utf-8")
     found |= {"written": str(path), "picture": str(picture)}
     if args.verify:
-        found["verified"] = _verify(args, best, given)
+        found["verified"] = _verify(args, best, given, wish)
     if args.json:
         print_json(found)
     else:
@@ -218,7 +218,7 @@ def cmd_design(args: argparse.Namespace) -> int:
     return 0 if found.get("verified", {"ok": True})["ok"] else EXIT_FAILED
 
 
-def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any]) -> dict[str, Any]:
+def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any], wish: Any) -> dict[str, Any]:
     from hil.report.view import progress
     from hil.tuning.bench import bench_of, spec_in, speed_drive
     from hil.tuning.optimise import law_of
@@ -227,5 +227,6 @@ def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any]) -> dict[
     setup, spread = speed_drive(args.config, overrides(args)), _spread(args.spread)
     law = law_of(best.tables, spec_in(setup), 1.0 / setup.config.loop.rate_hz)
     plants = 1 + len(bench_of(args.config, setup, spread=spread).plants())
+    shafts = wish.shafts(plants - 1)
     with progress(f"verify on {plants} plants", plants) as seen:
-        return verify(args.config, overrides(args), best.tables, given, spread, law, seen)
+        return verify(args.config, overrides(args), best.tables, given, spread, law, seen, shafts)

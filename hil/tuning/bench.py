@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from hil.config.design import law_spec, motor_model, speed_filter
-from hil.control.law import CASCADE, FAC, MTPA, PI, SPEED, LawSpec
+from hil.control.law import CASCADE, FAC, MTPA, PI, SPEED, LawSpec, MotorModel
 from hil.errors import HilError
 from hil.report.metrics import RECOVERED_RAD_S, find_step, operating
 from hil.runtime.setup import Overrides, Setup, load_setup
@@ -19,10 +19,10 @@ from hil.sim.emulate import load_plant
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.measure import Bench
 
-UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
-"""Spread where none is given."""
 QUIET_S: Final = 0.5
 """Time before the load step in which the noise of the command is measured."""
+UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
+"""Spread where none is given."""
 
 
 def speed_drive(path: Path, overrides: Overrides) -> Setup:
@@ -55,14 +55,18 @@ def takes_voltage(setup: Setup) -> bool:
 def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = None, **more: Any) -> Bench:
     """The bench of a config; ``given`` replaces load [N m], w_noise [rad/s], i_noise [A] of the plant's file.
 
-    The resolution of frames and modulator counts as noise of q / sqrt(12). Raises HilError.
+    The resolution of frames and modulator counts as noise of q / sqrt(12). A soft coupling of the plant's
+    file is the elastic shaft where none is given. Raises HilError.
     """
-    sensors, load, u_lsb = (0.0, 0.0), None, 0.0
+    sensors, load, u_lsb, brake = (0.0, 0.0), None, 0.0, False
     if setup.config.emulator is not None:
         plant, _ = load_plant(path, setup.config)
         sensors = plant.sensors.w_noise_rad_s, plant.sensors.i_noise_a
-        steps = [abs(one.torque_n_m) for one in plant.load if one.kind in ("step", "brake")]
-        load, u_lsb = max(steps, default=None), plant.inverter.resolution_v
+        steps = [(abs(one.torque_n_m), one.kind) for one in plant.load if one.kind in ("step", "brake")]
+        (load, kind), u_lsb = max(steps, default=(None, "")), plant.inverter.resolution_v
+        brake = kind == "brake"
+        if plant.coupling is not None and not more.get("shafts"):
+            more["shafts"] = (_elastic(plant.masses),)
     own = {name: value for name, value in (given or {}).items() if value is not None}
     more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
     motor, lsb = motor_model(setup.config.motor), setup.wire.x_lsb
@@ -77,9 +81,16 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         math.hypot(own.get("i_noise", sensors[1]), lsb[1] / math.sqrt(12)),
         max(u_lsb, setup.wire.u_lsb) / math.sqrt(12) if takes_voltage(setup) else 0.0,
         _speed(setup),
+        brake=brake,
         i_d_noise=math.hypot(own.get("i_noise", sensors[1]), lsb[2] / math.sqrt(12)),
         **more,
     )
+
+
+def _elastic(shaft: Any) -> tuple[float, float, float]:
+    """Resonance [Hz], damping ratio d w_r / 2c, and the motor's share of J, of a plant's masses."""
+    w_r = shaft.resonance_rad_s
+    return w_r / (2.0 * math.pi), 0.5 * shaft.d * w_r / shaft.c, shaft.J_m / (shaft.J_m + shaft.J_l)
 
 
 def _own_loop(setup: Setup, spread: dict[str, float]) -> dict[str, Any]:
@@ -151,14 +162,32 @@ def _settled(own: TickArray, row: int) -> int:
     return min(round(0.4 / period_s), int(changed[0]) + 1 if len(changed) else len(own) - row)
 
 
-def corner_settings(bench: Bench) -> list[list[str]]:
-    """The corners of the spread as settings of the plant's file."""
-    out = []
-    for m in bench.corners():
-        motor = {"R_s_ohm": m.R_s, "L_d_h": m.L_d, "L_q_h": m.L_q, "psi_f_wb": m.psi_f, "n_p": m.n_p}
-        motor |= {"J_kg_m2": m.J, "B_f_n_m_s": m.B_f}
-        out.append(["motor={" + ", ".join(f"{name} = {value!r}" for name, value in motor.items()) + "}"])
-    return out
+def plant_settings(bench: Bench) -> list[list[str]]:
+    """The believed motor and the corners of the spread, on elastic shafts, as settings of the plant."""
+    return [
+        [_motor(motor), *coupled(at)]
+        for motor, at in zip((bench.motor, *bench.corners()), bench.turns(), strict=True)
+    ]
+
+
+def _motor(m: MotorModel) -> str:
+    """A motor as a setting."""
+    motor = {"R_s_ohm": m.R_s, "L_d_h": m.L_d, "L_q_h": m.L_q, "psi_f_wb": m.psi_f, "n_p": m.n_p}
+    motor |= {"J_kg_m2": m.J, "B_f_n_m_s": m.B_f}
+    return f"motor={_inline(motor)}"
+
+
+def coupled(at: tuple[float, float, float] | None) -> list[str]:
+    """An elastic shaft (Hz, damping, motor's share of J) as a setting; none for a rigid one."""
+    if at is None:
+        return []
+    hz, damping, share = at
+    keys = {"inertia_ratio": (1.0 - share) / share, "resonance_hz": hz, "damping_ratio": damping}
+    return [f"coupling={_inline(keys)}"]
+
+
+def _inline(keys: dict[str, float]) -> str:
+    return "{" + ", ".join(f"{name} = {value!r}" for name, value in keys.items()) + "}"
 
 
 def simulated(path: Path, overrides: Overrides, plant: list[str]) -> Seen:

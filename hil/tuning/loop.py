@@ -23,6 +23,10 @@ LOAD, PULSE_W, PULSE_I, PULSE_U = range(4)
 QUIET: Final = 3
 """Ticks at rest before it, at least: the observer's memory is filled by then."""
 NO_LIMIT: Final = 1e300
+SETTLED: Final = 6
+"""Windows, of 50 ticks at least, after which a turning motor is at rest but for that."""
+SMALL: Final = (0.1, 0.01, 0.01, 0.1, 0.1)
+"""Pulses of :func:`respond_turning` [rad/s, A, A, V, V]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +55,12 @@ def one_mass(motor: MotorModel) -> tuple[Array, Array]:
 
 
 def two_masses(
-    motor: MotorModel, hz: float, damping: float = 0.01, share: float = 0.5
+    motor: MotorModel, hz: float, damping: float = 0.01, share: float = 0.5, brake: bool = False
 ) -> tuple[Array, Array]:
     """A (4, 4) and the load's effect (4,): two inertias on an elastic shaft.
 
     Resonance [Hz], its damping, the motor's share of J; x = (w, i_q, torsion, w_load);
-    k = w_r^2 J_m J_l / J, c = 2 damping k / w_r.
+    k = w_r^2 J_m J_l / J, c = 2 damping k / w_r. A load acts behind the shaft, a ``brake`` on the motor.
     """
     J_m, J_l, w_r = motor.J * share, motor.J * (1 - share), 2 * np.pi * hz
     k = w_r**2 * J_m * J_l / motor.J
@@ -66,7 +70,7 @@ def two_masses(
     A[1, :2] = motor.A()[1, :2]
     A[2] = 1, 0, 0, -1
     A[3] = c / J_l, 0, k / J_l, -c / J_l
-    return A, np.array([0.0, 0.0, 0.0, -1 / J_l])
+    return A, np.array([-1 / J_m, 0.0, 0.0, 0.0] if brake else [0.0, 0.0, 0.0, -1 / J_l])
 
 
 def rigid(motor: MotorModel, T_s: float) -> Plant:
@@ -74,9 +78,11 @@ def rigid(motor: MotorModel, T_s: float) -> Plant:
     return _by_voltage(motor, T_s, *one_mass(motor))
 
 
-def shaft(motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share: float = 0.5) -> Plant:
+def shaft(
+    motor: MotorModel, T_s: float, hz: float, damping: float = 0.01, share: float = 0.5, brake: bool = False
+) -> Plant:
     """Motor and load on an elastic shaft (:func:`two_masses`)."""
-    return _by_voltage(motor, T_s, *two_masses(motor, hz, damping, share))
+    return _by_voltage(motor, T_s, *two_masses(motor, hz, damping, share, brake))
 
 
 def _by_voltage(motor: MotorModel, T_s: float, A: Array, load: Array) -> Plant:
@@ -123,6 +129,62 @@ def respond_all(p: Any, s: Any, A: Array, b: Array, e: Array, kinds: Any, out: A
     for m in range(A.shape[0]):
         for j in range(kinds.shape[0]):
             respond(p, s, A[m], b[m], e[m], kinds[j], out[m, j])
+
+
+def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array) -> tuple[Array, Array]:
+    """A (n, n), B (n, 3) of (dw, i_q, ..., i_d) about the speed w: x+ = A x + B (u_q, u_d, 1).
+
+    ``mechanics`` is A of :func:`one_mass` or :func:`two_masses`; with omega = n_p w the axes are coupled by
+        L_q di_q/dt = u_q - .. - omega (L_d i_d + psi_f),  L_d di_d/dt = u_d - R_s i_d + omega L_q i_q
+    """
+    n, omega = len(mechanics) + 1, motor.n_p * w
+    whole = np.zeros((n + 3, n + 3))
+    whole[: n - 1, : n - 1] = mechanics
+    whole[1, n - 1], whole[1, n], whole[1, n + 2] = (
+        np.array([-omega * motor.L_d, 1, -omega * motor.psi_f]) / motor.L_q
+    )
+    whole[n - 1, 1], whole[n - 1, n - 1], whole[n - 1, n + 1] = (
+        np.array([omega * motor.L_q, -motor.R_s, 1]) / motor.L_d
+    )
+    step = expm(whole * T_s)
+    return np.ascontiguousarray(step[:n, :n]), np.ascontiguousarray(step[:n, n:])
+
+
+@jit
+def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, out: Array) -> None:
+    """u_q and dw after pulses on w, i_q, i_d, u_q, u_d, one after the other; ``out`` (5, 2, K) per unit.
+
+    The motor runs at w (:func:`turning`), so law and motor couple the axes. The pulses are so small that this
+    is as good as linear; what the loop does without them (it starts, a shaft rings) is taken off.
+    """
+    n, K = A.shape[0], out.shape[2]
+    x, new = np.empty(n), np.empty(n)
+    rest = SETTLED * max(p["N"][0], p["N"][1], 50)
+    for size in range(2):
+        reset(s)
+        x[:] = 0.0
+        u_q, u_d = -B[1, 2] / B[1, 0], 0.0  # against the back-EMF
+        apply(s, 0.0, u_q, u_d)
+        for k in range(-rest, 5 * K):
+            kind, at = k // K, k % K
+            pulse = size * SMALL[kind] if k >= 0 and at == 0 else 0.0
+            on_w, on_q, on_d = pulse * (kind == 0), pulse * (kind == 1), pulse * (kind == 2)
+            observe(p, s, w + x[0] + on_w, x[1] + on_q, x[n - 1] + on_d, True, 1)
+            apply(s, 0.0, u_q, u_d)
+            command(p, s, w, 0.0, 0.0, NO_LIMIT)
+            if k >= 0 and size == 0:
+                out[kind, 0, at], out[kind, 1, at] = s["u"][1], x[0]
+            elif k >= 0:
+                out[kind, 0, at] = (s["u"][1] - out[kind, 0, at]) / SMALL[kind]
+                out[kind, 1, at] = (x[0] - out[kind, 1, at]) / SMALL[kind]
+            q, d = u_q + pulse * (kind == 3), u_d + pulse * (kind == 4)
+            for r in range(n):
+                total = B[r, 0] * q + B[r, 1] * d + B[r, 2]
+                for c in range(n):
+                    total += A[r, c] * x[c]
+                new[r] = total
+            x[:] = new
+            u_q, u_d = s["u"][1], s["u"][2]
 
 
 @jit

@@ -31,9 +31,12 @@ from hil.tuning.loop import (
     PULSE_W,
     Plant,
     Record,
+    one_mass,
     respond_all,
+    respond_turning,
     rigid,
     shaft,
+    turning,
     two_masses,
 )
 from hil.tuning.sensitivity import margins_of, peak_of
@@ -42,6 +45,10 @@ RESPONSE_S: Final = 0.4
 """Length of the responses; a loop that has not come to rest by then counts as unstable."""
 RESTLESS: Final = 0.1
 """Share of the dip that may be left in the last tenth of the response."""
+SPARE: Final = 0.5
+"""Share of an elastic shaft's damping with which a design has to be stable: what it may take is the rest."""
+RINGING_S: Final = 4.0
+"""Length of the responses on an elastic shaft, whose vibration outlasts the others."""
 _MODES: Final[tuple[Literal["short", "N"], ...]] = ("short", "N")
 _STEP, _OWN_STEP = np.array([LOAD, PULSE_U]), np.array([LOAD, PULSE_W])
 _NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U])
@@ -51,9 +58,10 @@ _NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U])
 class Bench:
     """What a law is tuned for: believed motor, T_s [s], load step [N m], noise of w, i_q [rad/s, A], u [V].
 
-    Noises are standard deviations with the resolution in them; at a speed ``w_0`` [rad/s] decoupling adds
-    n_p w_0 L_d i_d's noise to u_q; ``spread`` is the share by which J, psi_f, R_s
+    Noises are standard deviations with the resolution in them; at the speed ``w_0`` [rad/s], where the
+    axes are coupled; ``spread`` is the share by which J, psi_f, R_s
     and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with;
+    ``brake``: the load step acts on the motor, not behind the shaft;
     ``i_d_noise`` is that of i_d where its frame is coarser than i_q's. Of a drive with a current loop of its
     own (``inner``) u is in its ``unit``, A or N m, and ``filter`` is what its speed really comes through.
     """
@@ -67,6 +75,7 @@ class Bench:
     w_0: float = 0.0
     spread: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3))
     shafts: tuple[tuple[float, float, float], ...] = ()
+    brake: bool = False
     i_d_noise: float = 0.0
     inner: InnerLoop | None = None
     filter: SpeedFilter | None = None
@@ -99,13 +108,23 @@ class Bench:
     def plant(self, motor: MotorModel, at: tuple[float, float, float] | None = None) -> Plant:
         """A motor, on an elastic shaft (Hz, damping, share) where one is given, behind what drives it."""
         if self.inner is None:
-            return shaft(motor, self.T_s, *at) if at else rigid(motor, self.T_s)
+            return shaft(motor, self.T_s, *at, self.brake) if at else rigid(motor, self.T_s)
         inner = replace(self.inner, k_u=self.inner.k_u * motor.k_t / self.motor.k_t)
-        return shaft_of(motor, inner, self.filter, self.T_s, two_masses(motor, *at) if at else None)
+        masses = two_masses(motor, *at, self.brake) if at else None
+        return shaft_of(motor, inner, self.filter, self.T_s, masses)
 
     def shaft_plants(self) -> list[Plant]:
-        """The believed motor on its elastic shafts."""
-        return [self.plant(self.motor, one) for one in self.shafts]
+        """The believed motor and every corner on each elastic shaft, of whose damping SPARE is left."""
+        motors, shafts = (self.motor, *self.corners()), self.shafts
+        return [self.plant(motor, (hz, SPARE * d, share)) for motor in motors for hz, d, share in shafts]
+
+    def turns(self) -> list[tuple[float, float, float] | None]:
+        """The elastic shaft of each of :meth:`plants`, of several in turn; None where there is none.
+
+        Neighbours among the corners get resonances far apart, so that none goes with a low J alone.
+        """
+        count, shafts = 1 + len(self.corners()), self.shafts or (None,)
+        return [shafts[7 * j % len(shafts)] for j in range(count)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +142,7 @@ class Loop:
         return math.isfinite(self.ms)
 
 
+UNQUIET: Final = (math.inf, math.inf)
 UNSTABLE: Final = Loop(math.inf, math.inf, math.inf, math.inf)
 
 
@@ -220,20 +240,78 @@ def _loop(w: Array, u: Array, T_s: float) -> Loop:
     return Loop(float(error.max()), recovery, float(error.sum() * T_s), peak_of(u))
 
 
-def noise(law: Record, bench: Bench, plant: Plant) -> tuple[float, float]:
-    """Noise of the command [bench.unit] and of the true speed [rad/s], rms, for the bench's; at rest."""
-    law = held(law, "N")
-    out = responses(law, [plant], _NOISE, bench.ticks)[0]
-    u_i = 1.0 if bench.inner is None else bench.inner.u_i
-    sigma = np.array([bench.w_noise, bench.i_noise * u_i, bench.u_noise])
-    energy = (out[:, (0, 2)] ** 2).sum(axis=2) / bench.every
-    u, w = np.sqrt((sigma[:, None] ** 2 * energy).sum(axis=0))
-    if own_loop(law):
-        return float(u), float(w)
-    decoupling = bench.motor.n_p * bench.w_0 * bench.motor.L_d * bench.i_noise if law["coupling"][0] else 0.0
+def noise(
+    law: Record, bench: Bench, motor: MotorModel | None = None,
+    at: tuple[float, float, float] | None = None, ticks: int | None = None,
+) -> tuple[float, float]:  # fmt: skip
+    """Noise of the command [bench.unit] and of the true speed [rad/s], rms, for the bench's, at its speed.
+
+    Of another ``motor`` than that of the bench, on an elastic shaft ``at``, from responses of ``ticks``.
+    """
+    law, motor, ticks = held(law, "N"), motor or bench.motor, ticks or bench.ticks
+    coupled = bench.inner is None and not adapts(law)
+    if coupled:
+        out, i_noise = turning_responses(law, bench, motor, at, ticks), bench.i_noise
+        sigma = np.array([bench.w_noise, i_noise, i_noise, bench.u_noise, bench.u_noise])
+    else:
+        out = responses(law, [bench.plant(motor, at)], _NOISE, ticks)[0][:, (0, 2)]
+        u_i = 1.0 if bench.inner is None else bench.inner.u_i
+        sigma = np.array([bench.w_noise, bench.i_noise * u_i, bench.u_noise])
+    u, w = np.sqrt((sigma[:, None] ** 2 * (out**2).sum(axis=2) / bench.every).sum(axis=0))
+    return float(u) if coupled else math.hypot(float(u), _decoupling(law, bench)), float(w)
+
+
+def _decoupling(law: Record, bench: Bench) -> float:
+    """What i_d's noise adds to u_q of an adaptive law, n_p w_0 L_d times it; 0 of a drive with its own loop.
+
+    The coupled loop makes a fifth too much of it, so it is taken by itself.
+    """
+    if bench.inner is not None or not law["coupling"][0]:
+        return 0.0
+    noise = bench.motor.n_p * bench.w_0 * bench.motor.L_d * bench.i_noise
     if F := int(law["N"][0, 2] - law["short"][0, 2]) if law["short"][0, 2] else 0:
-        decoupling *= math.sqrt(2.0 * (2 * F + 1) / ((F + 1) * (F + 2)))  # the end of a line through F + 1
-    return math.hypot(float(u), decoupling), float(w)
+        noise *= math.sqrt(2.0 * (2 * F + 1) / ((F + 1) * (F + 2)))  # the end of a line through F + 1
+    return noise
+
+
+def turning_responses(
+    law: Record, bench: Bench, motor: MotorModel, at: tuple[float, float, float] | None, ticks: int
+) -> Array:
+    """Command and speed (5, 2, ticks) of :func:`hil.tuning.loop.respond_turning`, at the bench's speed."""
+    own, mechanics = law.copy(), two_masses(motor, *at) if at else one_mass(motor)
+    own["cogs"], own["i_max"] = 0, np.inf
+    out = _buffer((5, 2, ticks))
+    with np.errstate(over="ignore", invalid="ignore"):
+        respond_turning(
+            own[0], _state()[0], *turning(motor, bench.T_s, bench.w_0, mechanics[0]), bench.w_0, out
+        )
+    return out
+
+
+def foretold(law: Record, bench: Bench) -> list[tuple[float, float]]:
+    """Dip [rad/s] and noise of the command [bench.unit] with each plant, on its elastic shaft if it has one.
+
+    Infinite where the loop is unstable.
+    """
+    motors = (bench.motor, *bench.corners())
+    if not bench.shafts:
+        plants = bench.plants()
+        dips = [loop.dip for loop in loops(law, bench, plants)]
+        noises = [noise(law, bench, motor)[0] for motor in motors]
+        return list(zip(dips, noises, strict=True))
+    each = list(zip(motors, bench.turns(), strict=True))
+    calm = quiet(law, bench, [bench.plant(*one) for one in each], RINGING_S)
+    return [_ringing(law, bench, *one) if rests else UNQUIET for one, rests in zip(each, calm, strict=True)]
+
+
+def _ringing(
+    law: Record, bench: Bench, motor: MotorModel, at: tuple[float, float, float] | None
+) -> tuple[float, float]:
+    """Of :func:`foretold`, where the vibration outlasts the response that a dip is read from."""
+    stepped, plant = to_unit_load(law, bench.load) if adapts(law) else law, bench.plant(motor, at)
+    w = responses(stepped, [plant], _STEP[:1], bench.ticks)[0, 0, 1 if own_loop(law) else 2]
+    dip = float(np.abs(w).max() * bench.load)
+    return dip, noise(law, bench, motor, at, round(RINGING_S / bench.T_s))[0]
 
 
 def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
@@ -302,5 +380,5 @@ def judge(law: Record, bench: Bench, plants: Sequence[Plant] | None = None) -> V
     """All measures of a law; the first plant is the nominal one."""
     plants = bench.plants() if plants is None else plants
     every = loops(law, bench, plants)
-    u, w = noise(law, bench, plants[0])
+    u, w = noise(law, bench)
     return Verdict(every[0], worst_of(every), u, w)

@@ -111,7 +111,7 @@ class _Search:
         nominal = loops(law, self.bench, [self.nominal])[0]
         if not nominal.stable:
             return 1e5
-        u, _ = noise(law, self.bench, self.nominal)
+        u, _ = noise(law, self.bench)
         first = self._over(u, nominal, nominal)
         if not math.isfinite(u) or first > 0.3:
             return 1e3 * (1 + min(first, 50.0))
@@ -124,8 +124,9 @@ class _Search:
             return 10.0 * (1 + over)
         value = min(u, 9.0) if self.aim == "noise" else min(worst_of(every).iae / self._scale, 9.0)
         if value < self.best:  # what is not the best need not be asked whether it may be
-            if self.shafts and not all(quiet(law, self.bench, self.shafts)):
-                return 20.0
+            calm = quiet(law, self.bench, self.shafts)
+            if not all(calm):
+                return 20.0 + 10.0 * calm.count(False) / len(calm)
             self.best = value
         return value
 

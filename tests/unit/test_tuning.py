@@ -286,7 +286,7 @@ def test_a_shaft_makes_the_design_slower() -> None:
         "a design for these limits without a shaft"
     )
     shafts = tuple((f, 0.01, 0.5) for f in hz)
-    soft = tune(family("ftdob"), bench(shafts=shafts), Limits(0.11, 1.6, 2.3), SPEC, effort=0.2)
+    soft = tune(family("ftdob"), bench(shafts=shafts), Limits(0.11, 1.6, 2.3), SPEC, effort=0.5)
     assert soft.feasible and all(quiet(law_of(soft.tables, SPEC, 1e-3), BENCH, plants, 4.0))
     assert soft.verdict.nominal.dip > judge(law_of(FAST, SPEC, 1e-3), BENCH).nominal.dip
 
