@@ -43,7 +43,7 @@ unit: $(STAMP) ## all tests, compiled
 
 # The same kernels with the compiler off: line and branch coverage can see into them.
 interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q -m "not process and not vm and not compiled" $(JITTED) \
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -q $(PARALLEL) -m "not process and not vm and not compiled" $(JITTED) \
 	    $(COVER) --cov-branch --cov-report=term-missing:skip-covered --cov-fail-under=90
 
 vm: $(STAMP) ## the tests on a real SocketCAN bus (natively or in the bench machine)

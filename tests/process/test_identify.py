@@ -18,7 +18,7 @@ from hil.log.reader import open_log
 from hil.replay import replay
 from tests.conftest import CONFIGS, ROOT
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.beside]
 GOALS = {"R_s": 0.02, "L_d": 0.02, "L_q": 0.02, "psi_f": 0.02, "J": 0.03}
 KEYS = {"R_s": "R_s_ohm", "L_d": "L_d_h", "L_q": "L_q_h", "psi_f": "psi_f_wb", "J": "J_kg_m2"}
 

@@ -20,7 +20,7 @@ from hil.sim.demo import closed_loop
 from hil.sim.simulate import simulate_ticks
 from tests.conftest import ROOT
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.beside]
 
 
 def identify(*args: str) -> subprocess.CompletedProcess[str]:

@@ -25,7 +25,7 @@ from hil.log.reader import Frame, open_log
 from hil.replay import replay
 from tests.conftest import CONFIGS, ROOT
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.beside]
 TRUE = {"k_t_over_j": 1.5 * 3 * 0.76 / 0.01265, "j": 3.6 * 0.01265 / (1.5 * 3 * 0.76), "lag": 1e-3}
 """Of configs/motors/bench.toml, J for the k_t that is believed; the configurations believe 327 and 0.011."""
 COULOMB, B_F = 0.2 * 3.6 / (1.5 * 3 * 0.76), 4e-4 * 3.6 / (1.5 * 3 * 0.76)

@@ -28,7 +28,7 @@ from hil.signals import FIELDS, INPUTS, DriveState
 from hil.sim.demo import emulator_process
 from tests.conftest import CONFIGS
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.beside]
 
 NOT_ON_THE_WIRE = {"t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "recorded_ns", "check"}
 """Times, and the check that a record carries over all its fields, these included; replay judges that."""
