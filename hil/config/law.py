@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, create_model
 
-from hil.config.motor import AnticoggingTable
+from hil.config.motor import AnticoggingTable, IdTable
 from hil.config.table import LEAST, MOST, Table, included
 from hil.control.registry import REQUIRED, Key, laws, observers
 
@@ -17,6 +17,8 @@ def _annotation(key: Key) -> tuple[Any, Any]:
     """Type and default of a member's key, as pydantic takes them."""
     if key.type == "flag":
         return bool, Field(key.default, description=key.doc)
+    if key.type == "i_d_table":
+        return Annotated[IdTable | None, BeforeValidator(included)], Field(key.default, description=key.doc)
     most = MOST if key.most is None else key.most
     least = LEAST if key.least is None and key.above == 0.0 else key.least
     bounds: Any = Field(gt=key.above, ge=least, le=most, allow_inf_nan=False)

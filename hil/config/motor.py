@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from hil.config.table import Finite, NonNegative, Positive, Table
 from hil.control.cogging import MOST_ORDER, ORDERS, Harmonics
+from hil.control.mtpa import POINTS
 
 
 class IdentifiedTable(Table):
@@ -59,6 +60,25 @@ class MotorTable(Table):
     """Viscous friction B_f: torque over mechanical speed."""
     identified: IdentifiedTable | None = None
     """Where the values come from, when hil identify found them."""
+
+
+class IdTable(Table):
+    """i_d* of a motor over the size of i_q*, linear between the points; for both signs of i_q*."""
+
+    i_q_a: Annotated[list[NonNegative], Field(min_length=2, max_length=POINTS)]
+    """Sizes of i_q*, ascending from 0."""
+    i_d_a: Annotated[list[Finite], Field(min_length=2, max_length=POINTS)]
+    """i_d* at each; past the last as there."""
+
+    @model_validator(mode="after")
+    def _rises(self) -> IdTable:
+        if len(self.i_q_a) != len(self.i_d_a):
+            raise ValueError(
+                f"i_q_a has {len(self.i_q_a)} entries and i_d_a {len(self.i_d_a)}; give one i_d an i_q"
+            )
+        if self.i_q_a[0] != 0.0 or any(a >= b for a, b in zip(self.i_q_a, self.i_q_a[1:], strict=False)):
+            raise ValueError("i_q_a must ascend from 0; sort the rows by i_q_a, each once")
+        return self
 
 
 class AnticoggingTable(Table):

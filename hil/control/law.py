@@ -26,7 +26,7 @@ from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
 from hil.control.jit import jit
 from hil.control.linalg import Array, copy, exp, matvec, matvec_add
-from hil.control.mtpa import operating_point, voltage
+from hil.control.mtpa import POINTS, operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.regen import RegenLimit, braked, regen_params
 from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
@@ -130,6 +130,9 @@ LAW_PARAMS: Final = np.dtype(
         ("p_regen", "f8"),
         ("v_regen", "f8"),
         ("g_regen", "f8"),
+        ("points", "i8"),
+        ("i_q_at", "f8", POINTS),
+        ("i_d_at", "f8", POINTS),
     ],
     align=True,
 )
@@ -142,7 +145,8 @@ adaptive window after a change (:mod:`hil.control.adaptive`), whose bounds are i
 the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to the next where these are
 several, else 0, and ``span``: what an innovation rests on then, where there is a filter; from ``cogs`` on the
 load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); from ``regen`` on what may go
-back to the DC link (:mod:`hil.control.regen`)."""
+back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
+``mtpa`` (:func:`hil.control.mtpa.by_table`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -153,8 +157,9 @@ _SALIENT = ("R_s", "u_share")
 _SELDOM = ("every", "span")
 _COGGING = ("cogs", "cog_order", "cog_a", "cog_b", "cog_lead", "cog_lag", "cog_slow")
 _REGEN = ("regen", "p_regen", "v_regen", "g_regen")
+_TABLED = ("points", "i_q_at", "i_d_at")
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING, *_REGEN), 0.0
+    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING, *_REGEN, *_TABLED), 0.0
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -432,6 +437,8 @@ def _lead(spec: LawSpec, values: Mapping[str, Any], T_s: float) -> tuple[float, 
     """(lead [s], lam) of :func:`hil.control.cogging.ahead`; of the law speed when its command acts."""
     if spec.inner is not None:
         return (1.0 + spec.inner.delay) * T_s, 0.0
+    if spec.kind == "fac":  # it commands the load itself, without a current's lag
+        return 1.5 * T_s, 0.0
     lam = float(values.get("lam_q", 0.0))
     if spec.kind == "pi":
         lam = exp(-float(values["k_p"][1]) / spec.motor.L_q * T_s)

@@ -22,6 +22,8 @@ from hil.control.jit import jit
 
 NEWTON: Final = 8
 """Steps to y of :func:`least_current`: from above, without overshoot; the last bits are there after six."""
+POINTS: Final = 32
+"""Most points of a table of i_d*."""
 HALVINGS: Final = 52
 """Of an interval of i_d no longer than 2 i_max: its end is 2^-51 i_max from the point."""
 
@@ -40,6 +42,37 @@ def least_current(psi_f: float, s: float, tau: float) -> tuple[float, float]:
     f = psi_f * (1.0 + y)
     i_q = tau / f
     return -s * i_q * i_q / f, i_q
+
+
+@jit
+def by_table(p: Any, psi_f: float, s: float, tau: float) -> tuple[float, float]:
+    """(i_d, i_q) [A] for tau by the table i_d(|i_q|), linear between its points, constant past the last.
+
+    Between two points i_d = a + b |i_q|, so |tau| = (psi_f - s a - s b |i_q|) |i_q|, which rises with |i_q|.
+    """
+    size, a, b = abs(tau), 0.0, 0.0
+    for j in range(p["points"] - 1):
+        q, d = p["i_q_at"][j], p["i_d_at"][j]
+        b = (p["i_d_at"][j + 1] - d) / (p["i_q_at"][j + 1] - q)
+        a = d - b * q
+        if size <= (psi_f - s * p["i_d_at"][j + 1]) * p["i_q_at"][j + 1]:
+            break
+    last = p["points"] - 1
+    if size > (psi_f - s * p["i_d_at"][last]) * p["i_q_at"][last]:
+        a, b = p["i_d_at"][last], 0.0
+    c = psi_f - s * a
+    i_q = 2.0 * size / (c + math.sqrt(max(c * c - 4.0 * s * b * size, 0.0)))
+    return a + b * i_q, i_q if tau >= 0.0 else -i_q
+
+
+@jit
+def wanted_current(p: Any, psi_f: float, s: float, tau: float) -> tuple[float, float]:
+    """(i_d, i_q) [A] for tau: by the table where there is one and it keeps to i_max, else of least |i|."""
+    if p["points"] > 0:
+        i_d, i_q = by_table(p, psi_f, s, tau)
+        if i_d * i_d + i_q * i_q <= p["i_max"] * p["i_max"]:
+            return i_d, i_q
+    return least_current(psi_f, s, tau)
 
 
 @jit
@@ -136,14 +169,14 @@ def weakened(p: Any, tau: float, w: float, u: float, i_d: float) -> float:
 
 @jit
 def operating_point(p: Any, tau: float, w: float, u: float) -> tuple[float, float, bool]:
-    """(i_d, i_q) [A] of least |i| for tau [Wb A] at w [rad/s], |u| <= u, |i| <= i_max; True: tau was capped.
+    """(i_d, i_q) [A] wanted for tau [Wb A] at w [rad/s], |u| <= u, |i| <= i_max; True: tau was capped.
 
     Past the speed at which even i_d = -i_max leaves no torque: i_q = 0, at the i_d that takes least voltage.
     """
     psi_f, s, i_max = p["k_t"] / (1.5 * p["n_p"]), p["L_q"] - p["L_d"], p["i_max"]
     bound = 2.0 * i_max * (psi_f + abs(s) * i_max)  # more than any point has: keeps what follows finite
     tau = min(max(tau, -bound), bound)
-    i_d, i_q = least_current(psi_f, s, tau)
+    i_d, i_q = wanted_current(p, psi_f, s, tau)
     if i_d * i_d + i_q * i_q <= i_max * i_max and fits(p, w, u, i_d, i_q):
         return i_d, i_q, False
     sign = 1.0 if tau >= 0.0 else -1.0

@@ -35,7 +35,7 @@ class Key:
 
     doc: str
     default: Any = REQUIRED
-    type: Literal["number", "numbers", "flag"] = "number"
+    type: Literal["number", "numbers", "flag", "i_d_table"] = "number"
     above: float | None = 0.0
     least: float | None = None
     most: float | None = None

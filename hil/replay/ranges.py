@@ -6,8 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from hil.control.cogging import ORDERS
 from hil.control.fac import MAX_GAP
 from hil.control.law import MTPA, N_MAX, ROWS
+from hil.control.mtpa import POINTS
 from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
 from hil.control.speed import MOST_DELAY
@@ -32,6 +34,8 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "first": (0, FIR_MAX),
         "every": (0, MAX_GAP),
         "span": (0, ROOM),
+        "cogs": (0, ORDERS),
+        "points": (0, POINTS),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {

@@ -98,6 +98,18 @@ def test_the_point_is_that_of_the_plants_own_motor_when_it_is_known() -> None:
     assert own["i_q"].mean() == pytest.approx(i_q, abs=0.01)
 
 
+def test_a_table_from_a_file_is_followed_in_the_loop(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text(
+        "i_q_a = [0.0, 5.0, 15.0]\ni_d_a = [0.0, -3.0, -5.0]\n", encoding="utf-8"
+    )
+    ticks = simulated((), "reference.w_rad_s=40.0", f'controller.i_d_table="{tmp_path / "own.toml"}"')
+    assert Reason(int(ticks["reason"][-1])) == Reason.STOP_REQUESTED
+    own = between(ticks, 3.5, 4.4)
+    assert np.abs(own["w"] - 40.0).max() < 0.1 and not own["guard_flags"].any()
+    assert np.allclose(own["i_d_ref"], -0.6 * own["i_q_ref"]) and own["i_d_ref"].max() < -0.5
+    assert np.abs(own["i_d"] - own["i_d_ref"]).max() < 0.05
+
+
 def test_the_estimate_is_judged_with_the_reluctance_torque_that_the_model_knows() -> None:
     setup = load_setup(PATH, Overrides())
     own, N = motor_model(setup.config.motor), exact_after(setup.machine.law)[0]

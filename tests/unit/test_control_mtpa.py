@@ -12,6 +12,7 @@ from scipy.optimize import brentq, minimize, minimize_scalar
 
 from hil.config.design import law_spec
 from hil.config.tables import RunConfig, load_toml
+from hil.control.cogging import ORDERS
 from hil.control.errors import ControlDesignError
 from hil.control.law import (
     LAW_PARAMS,
@@ -23,7 +24,7 @@ from hil.control.law import (
     observe,
     steady_room,
 )
-from hil.control.mtpa import NEWTON, fits, least_current, operating_point, voltage
+from hil.control.mtpa import NEWTON, POINTS, fits, least_current, operating_point, voltage
 from hil.errors import ConfigError
 from hil.replay.ranges import check_ranges
 from hil.tick.kernel import circle
@@ -253,6 +254,86 @@ def test_a_log_may_name_the_law_and_none_past_it() -> None:
     record["kind"] = MTPA + 1
     with pytest.raises(ValueError, match=r"law\.kind is 6, not within 0 to 5"):
         check_ranges("law", record)
+
+
+@pytest.mark.parametrize(("name", "most"), [("points", POINTS), ("cogs", ORDERS)])
+def test_a_log_names_no_row_past_a_table(name: str, most: int) -> None:
+    record = np.zeros(1, LAW_PARAMS)
+    record["max_gap"], record[name] = 1, most
+    check_ranges("law", record)
+    record[name] = most + 1
+    with pytest.raises(ValueError, match=rf"law\.{name} is {most + 1}, not within 0 to {most}"):
+        check_ranges("law", record)
+
+
+I_Q, I_D = (0.0, 3.0, 7.0, 12.0), (0.0, -0.5, -4.0, -5.0)
+
+
+def tabled(i_q: tuple[float, ...] = I_Q, i_d: tuple[float, ...] = I_D, i_max: float = I_MAX) -> Any:
+    p = params(i_max=i_max)
+    p["points"], p["i_q_at"][: len(i_q)], p["i_d_at"][: len(i_d)] = len(i_q), i_q, i_d
+    return p
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_table_gives_the_torque_exactly_at_its_interpolated_i_d(sign: float) -> None:
+    p = tabled()
+    for tau in sign * np.linspace(0.0, 11.0, 45):
+        i_d, i_q, capped = operating_point(p, tau, 20.0, 1e3)
+        assert not capped and torque(p, i_d, i_q) == pytest.approx(tau, rel=1e-13, abs=1e-13)
+        assert i_d == pytest.approx(np.interp(abs(i_q), I_Q, I_D), rel=1e-12, abs=1e-13)
+    nodes = [operating_point(p, sign * torque(p, d, q), 0.0, 1e3)[:2] for q, d in zip(I_Q, I_D, strict=True)]
+    assert np.allclose(nodes, [(d, sign * q) for q, d in zip(I_Q, I_D, strict=True)], rtol=1e-13, atol=1e-13)
+
+
+def test_a_table_of_the_least_current_is_the_closed_form_between_its_points_too() -> None:
+    plain, taus = params(), np.linspace(0.0, 14.0, POINTS)
+    nodes = [least_current(PSI_F, 0.03, tau) for tau in taus]
+    p = tabled(tuple(q for _, q in nodes), tuple(d for d, _ in nodes))
+    for tau in np.linspace(-13.0, 13.0, 100):
+        one, other = (operating_point(each, tau, 10.0, 1e3)[:2] for each in (p, plain))
+        assert math.hypot(*one) == pytest.approx(math.hypot(*other), rel=1e-3, abs=1e-9)
+
+
+def test_current_and_voltage_come_before_the_table() -> None:
+    """Where a row takes more than i_max the least current is taken; past base speed the field is weakened."""
+    p, plain = tabled(i_d=(0.0, -6.0, -12.0, -14.0)), params()
+    assert operating_point(p, 13.0, 10.0, 1e3) == operating_point(plain, 13.0, 10.0, 1e3)
+    assert operating_point(p, 1e3, 10.0, 1e3) == operating_point(plain, 1e3, 10.0, 1e3)
+    i_d, i_q, capped = operating_point(tabled(), 3.0, 300.0, U)
+    assert not capped and i_d < -0.5 and fits(p, 300.0, U * (1 + 1e-9), i_d, i_q)
+    assert torque(p, i_d, i_q) == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ("i_q_a=[0.0, 1.0, 1.0], i_d_a=[0.0, 0.0, 0.0]", "i_q_a must ascend from 0; sort the rows"),
+        ("i_q_a=[1.0, 2.0], i_d_a=[0.0, 0.0]", "i_q_a must ascend from 0"),
+        ("i_q_a=[0.0, 2.0, 3.0], i_d_a=[0.0, 0.0]", "i_q_a has 3 entries and i_d_a 2; give one i_d an i_q"),
+        ("i_q_a=[0.0], i_d_a=[0.0]", "i_q_a"),
+        ("i_q_a=[0.0, 1.0], i_d_a=[0.0, nan]", "i_d_a"),
+        ("i_q_a=[0.0, -1.0], i_d_a=[0.0, 0.0]", "i_q_a"),
+        ("i_q_a=[0.0, 1.0]", "i_d_a"),
+        (f"i_q_a={list(map(float, range(33)))}, i_d_a={[0.0] * 33}", "i_q_a"),
+        ("i_q=[0.0, 1.0], i_d_a=[0.0, 0.0]", "i_q"),
+    ],
+)
+def test_a_table_that_is_none_is_refused(table: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load_toml(CONFIGS / "salient.toml", RunConfig, [f"controller.i_d_table={{{table}}}"])
+    with pytest.raises(ConfigError, match="i_d_table"):
+        load_toml(CONFIGS / "salient.toml", RunConfig, ['controller.i_d_table="nowhere.toml"'])
+    with pytest.raises(ConfigError, match="unknown key"):
+        load_toml(CONFIGS / "demo.toml", RunConfig, [f"controller.i_d_table={{{table}}}"])
+
+
+def test_a_table_whose_torque_falls_is_refused() -> None:
+    given = "controller.i_d_table={i_q_a=[0.0, 3.0, 6.0], i_d_a=[0.0, 0.0, 15.0]}"
+    with pytest.raises(
+        ControlDesignError, match="up to i_q_a = 6 the torque does not rise with i_q; correct"
+    ):
+        design_law(law_spec(load_toml(CONFIGS / "salient.toml", RunConfig, [given])), 1e-3)
 
 
 def test_a_drive_that_takes_a_current_weakens_its_field_itself() -> None:

@@ -20,7 +20,7 @@ from hil.control.laws.speed import CODE
 from hil.control.laws.speed import MEMBER as OWN_LOOP
 from hil.control.registry import Key, Law, Plan, Values
 
-VOLTAGE = ("current_pole_rad_s", "current_d_pole_rad_s", "voltage_share")
+VOLTAGE = ("current_pole_rad_s", "current_d_pole_rad_s", "voltage_share", "i_d_table")
 """Keys of the current loop of a drive that takes voltages; of no effect for others."""
 _NEVER = {0: -1.0, 1: math.inf, -1: -math.inf}
 """Speed at which a row ends that ends by its time alone, by the sign of its torque."""
