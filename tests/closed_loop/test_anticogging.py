@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from hil.config.tables import RunConfig, load_toml
+from hil.control.errors import ControlDesignError
 from hil.identify.cogging import Cogging, response
 from hil.identify.coggingrun import LAPS, of_runs, picture, run_config, table_of, toml_of, with_table
+from hil.replay import replay
+from hil.replay.whatif import what_if
 from hil.report.metrics import operating
 from hil.runtime.setup import Overrides, load_setup, setup_of
 from hil.signals import OUTPUTS, Reason, TickArray
-from hil.sim.simulate import simulate_ticks
+from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import CONFIGS
 
 PATH = CONFIGS / "cogging.toml"
@@ -94,11 +97,56 @@ def test_the_ripple_of_a_slow_speed_drops_tenfold() -> None:
         "current_gain_v_a=6.5, current_integral_v_as=674.0}",
         'controller={kind="mtpa", speed_pole_rad_s=117.0, current_pole_rad_s=254.0}',
         'controller={kind="lq", speed_weight=2000.0}',
+        'controller={kind="deadbeat", speed_pole_rad_s=117.0}',
     ],
 )
 def test_every_law_of_the_speed_takes_it(law: str) -> None:
     before, after = simulated(law), simulated(law, inline(taught()[0]))
     assert ripple(after) < 0.4 * ripple(before), (ripple(before), ripple(after))
+
+
+FAC = (
+    'controller={kind="fac", speed_pole_rad_s=60.0, current_pole_rad_s=254.0, current_d_pole_rad_s=254.0}',
+    "limits.T_L_max_n_m=20.0",
+)
+
+
+def test_a_commanded_load_takes_it_without_a_currents_lag() -> None:
+    """The law fac gives the table's torque by the load machine, in the tick in which it acts."""
+    known = inline(taught()[0])
+    before, after = simulated(*FAC), simulated(*FAC, known)
+    assert Reason(int(after["reason"][-1])) == Reason.STOP_REQUESTED
+    law = load_setup(PATH, Overrides(settings=(*FAC, known))).machine.law
+    assert (law["cog_lead"][0], law["cog_lag"][0]) == (1.5e-3, 0.0)
+    assert ripple(after) < 0.4 * ripple(before), (ripple(before), ripple(after))
+
+
+def test_a_table_of_torques_has_none() -> None:
+    torque = 'controller={kind="torque", torque_n_m=[1.0], for_s=[1.0]}'
+    said = (
+        "controller.anticogging: the law torque follows no speed and gives what its table says; leave the key"
+    )
+    with pytest.raises(ControlDesignError, match=said):
+        load_setup(PATH, Overrides(settings=(torque, 'reference={kind="step", w_rad_s=0.0}', HARMONIC)))
+
+
+HARMONIC = "controller.anticogging={n_p=3, k_t_n_m_a=3.6, orders=[36], cos_n_m=[0.2], sin_n_m=[0.3]}"
+
+
+def test_what_if_with_a_table_and_without(tmp_path: Path) -> None:
+    """A run with it tells what it had been without, and the reverse; the same table tells nothing."""
+    short, logs = ("loop.duration_s=2.0", "reference.down_at_s=1.8"), {}
+    for name, own in (("off", short), ("on", (*short, HARMONIC))):
+        settings = (*own, f'log.folder="{tmp_path}"', f'log.name="{name}"')
+        simulate(load_setup(PATH, Overrides(settings=settings)), [])
+        logs[name] = tmp_path / f"{name}.mcap", load_toml(PATH, RunConfig, own)
+    for name, other in (("off", "on"), ("on", "off")):
+        log, own = logs[name]
+        same = what_if(log, PATH, own)
+        assert {key for key, spread in same.spreads.items() if spread.top} == set()
+        found = what_if(log, PATH, logs[other][1], tmp_path / f"{name}-{other}.mcap").spreads
+        assert found["d_hat_w"].top > 10.0 and found["i_q_ref"].top > 0.05, name
+        assert replay(tmp_path / f"{name}-{other}.mcap").verdict == "same"
 
 
 def test_zeros_are_nothing_to_the_bit_and_an_angle_alone_changes_nothing() -> None:
