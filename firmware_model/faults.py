@@ -126,6 +126,18 @@ class EncoderSlip(FaultTable):
     """Electrical angle by which the rotor angle is off."""
 
 
+class EncoderReversed(FaultTable):
+    """The encoder counts the wrong way: speed and rotor angle come with the other sign."""
+
+    kind: Literal["encoder-reversed"]
+
+
+class PhaseSwap(FaultTable):
+    """Phases b and c are exchanged between drive and motor."""
+
+    kind: Literal["phase-swap"]
+
+
 class PhaseLoss(FaultTable):
     """Phase a is open: no current flows in the stator's alpha axis."""
 
@@ -166,6 +178,16 @@ class BrownOut(FaultTable):
 
 LinkFault = Drop | Delay | Duplicate | Reorder | Corrupt | FrozenCounter | BusOff
 PlantFault = (
-    FrozenValue | Noise | Bias | EncoderSlip | PhaseLoss | DcLink | OverTemperature | ExtraLoad | BrownOut
+    FrozenValue
+    | Noise
+    | Bias
+    | EncoderSlip
+    | EncoderReversed
+    | PhaseSwap
+    | PhaseLoss
+    | DcLink
+    | OverTemperature
+    | ExtraLoad
+    | BrownOut
 )
 Fault = Annotated[LinkFault | PlantFault, Field(discriminator="kind")]

@@ -4,7 +4,9 @@ Phase loss: with phase a open i_alpha = 0, so the current vector lies on the bet
 angle theta, i_alpha = i_d cos - i_q sin and i_beta = i_d sin + i_q cos; after each short substep the current
 is projected onto i_alpha = 0. For L_d = L_q that is exact, since the beta equation does not hold i_alpha.
 theta counts from 0 at the beginning of the fault. Encoder slip by delta: the true voltage is the commanded
-one turned by delta, the measured current the true one turned back.
+one turned by delta, the measured current the true one turned back. An encoder that counts the wrong way is
+off by delta = -2 theta, with theta = 0 where the drive booted. Of two phases exchanged the drive sees the
+mirror image: u' = e^{-2j theta} conj(u), and the same of i, as d + j q.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from firmware_model.faults import (
     Bias,
     BrownOut,
     DcLink,
+    EncoderReversed,
     EncoderSlip,
     ExtraLoad,
     Fault,
@@ -29,10 +32,11 @@ from firmware_model.faults import (
     Noise,
     OverTemperature,
     PhaseLoss,
+    PhaseSwap,
 )
 from firmware_model.jit import jit
 from firmware_model.plant import ANGLE, LOAD_SPEED, TWIST, ErrorCode, State
-from firmware_model.sensors import to_wire
+from firmware_model.sensors import to_turn, to_wire
 
 OPEN_PHASE_STEP_NS: Final = 50_000
 _KEPT: Final = ("t_ns", "started", "temperature", "random", "syncs")
@@ -99,6 +103,8 @@ class PlantFaults:
         self, faults: Sequence[Fault], params: Record, echo_none: int, acted: Counter[int] | None = None
     ) -> None:
         self._faults, self._params, self._echo_none = faults, params, echo_none
+        if any(isinstance(fault, (EncoderReversed, PhaseSwap)) for fault in faults):
+            params["turns"] = 1  # they go by the shaft's angle
         self._own = params.copy()
         self._theta = np.zeros(1)
         self._frozen: dict[int, tuple[float, ...]] = {}
@@ -172,6 +178,12 @@ class PlantFaults:
             before = self._seen(s, out)
             if isinstance(fault, EncoderSlip):
                 self._slip(s, out, math.radians(fault.angle_deg))
+            elif isinstance(fault, EncoderReversed):
+                self._slip(s, out, -2.0 * self._electrical(s))
+                self._set(out, -out["w"], out["i_q"], out["i_d"])
+                out["theta"] = to_turn(-s["series"][ANGLE, 0], self._params[0]["theta_lsb"])
+            elif isinstance(fault, PhaseSwap):
+                self._swap(s, out, -2.0 * self._electrical(s))
             elif isinstance(fault, Bias):
                 self._set(out, out["w"] + fault.w_rad_s, out["i_q"] + fault.i_q_a, out["i_d"] + fault.i_d_a)
             elif isinstance(fault, FrozenValue):
@@ -187,6 +199,14 @@ class PlantFaults:
     def _slip(self, s: Any, out: Any, delta: float) -> None:
         s["u_q"], s["u_d"] = turned(s["u_q"], s["u_d"], delta)
         self._set(out, out["w"], *turned(out["i_q"], out["i_d"], -delta))
+
+    def _swap(self, s: Any, out: Any, delta: float) -> None:
+        s["u_q"], s["u_d"] = turned(-s["u_q"], s["u_d"], delta)
+        self._set(out, out["w"], *turned(-out["i_q"], out["i_d"], delta))
+
+    def _electrical(self, s: Any) -> float:
+        """The rotor's electrical angle [rad]."""
+        return float(self._params[0]["n_p"] * s["series"][ANGLE, 0])
 
     def _set(self, out: Any, *values: float) -> None:
         """Put measured values on the wire's grid into the sample."""

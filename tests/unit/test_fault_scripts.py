@@ -19,7 +19,7 @@ from firmware_model.config import PlantConfig, build_params, new_sample, new_sta
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.faulty_plant import PlantFaults, project, turned
 from firmware_model.node import wire_of
-from firmware_model.plant import State
+from firmware_model.plant import ANGLE, State
 from hil.config.tables import load_toml
 from hil.errors import ConfigError
 from hil.faults.matrix import Matrix, chosen, inline, load_matrix
@@ -253,6 +253,36 @@ def test_encoder_slip_turns_voltage_and_current_against_each_other() -> None:
     assert (s["u_q"], s["u_d"]) == pytest.approx((0.0, -10.0), abs=1e-12)
     assert (out["i_q"], out["i_d"]) == pytest.approx((-2.0, 0.0), abs=1e-12)
     assert turned(*turned(1.0, 2.0, 0.3), -0.3) == pytest.approx((1.0, 2.0))
+
+
+@pytest.mark.parametrize("kind", ["encoder-reversed", "phase-swap"])
+@pytest.mark.parametrize("theta", [0.0, 0.2, -1.1])
+def test_a_mirrored_drive_has_the_torque_of_its_mirror_image(kind: str, theta: float) -> None:
+    """By hand over a, b, c: out by the drive's angle, two of them exchanged, back by the true one."""
+    s, out, own = plant({"kind": kind, "at_s": 0.0})
+    s["series"][ANGLE, 0], s["u_q"], s["u_d"] = theta, 10.0, 3.0
+    out["w"], out["i_q"], out["i_d"] = 20.0, 2.0, 1.0
+    own.after(s, out)
+    its = -3 * theta if kind == "encoder-reversed" else 3 * theta  # 3 pole pairs
+    u, i = phases(10.0, 3.0, its), phases(2.0, 1.0, 3 * theta)
+    if kind == "phase-swap":
+        u, i = u[[0, 2, 1]], i[[0, 2, 1]]
+    assert (s["u_q"], s["u_d"]) == pytest.approx(dq(u, 3 * theta))
+    assert (out["i_q"], out["i_d"]) == pytest.approx(dq(i, its), abs=6e-3)
+    assert out["w"] == (-20.0 if kind == "encoder-reversed" else 20.0)
+    assert own._params[0]["turns"] == 1
+
+
+SHIFTS = np.array([0.0, -2.0, 2.0]) * math.pi / 3.0
+
+
+def phases(q: float, d: float, angle: float) -> np.ndarray:
+    return d * np.cos(angle + SHIFTS) - q * np.sin(angle + SHIFTS)
+
+
+def dq(abc: np.ndarray, angle: float) -> tuple[float, float]:
+    q, d = -2 / 3 * abc @ np.sin(angle + SHIFTS), 2 / 3 * abc @ np.cos(angle + SHIFTS)
+    return float(q), float(d)
 
 
 def test_bias_and_frozen_values_stand_on_the_grid_of_the_wire() -> None:
