@@ -22,8 +22,7 @@ from typing import Any, Final
 import numpy as np
 from rich.table import Table
 
-from benchmarks.motors import MOTORS, NAMES, WRONG, Array, bench, plant, settings
-from hil.config.toml import override, read_toml
+from benchmarks.motors import MOTORS, NAMES, WRONG, Array, bench, plant, rewrite, settings
 from hil.errors import HilError
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, motor_toml, planned, setup_for
@@ -59,16 +58,9 @@ def prepared(folder: Path, true: dict[str, float], wrong: Array) -> Path:
     path, _, _ = bench(folder, true)
     load = f'{{kind="step", torque_n_m={load_of(true)!r}, at_s={AT_S}, until_s={AT_S + 1.5}}}'
     own = folder / "plants" / "demo.toml"
-    _rewrite(own, [*plant(true)[1:], f"load=[{load}]"])
-    _rewrite(path, [*settings(true, wrong), "loop.duration_s=3.5", "criteria={}"])
+    rewrite(own, [*plant(true)[1:], f"load=[{load}]"])
+    rewrite(path, [*settings(true, wrong), "loop.duration_s=3.5", "criteria={}"])
     return path
-
-
-def _rewrite(path: Path, texts: list[str]) -> None:
-    data = read_toml(path)
-    for text in texts:
-        override(data, text, path.parent)
-    path.write_text(written(data, path, path), encoding="utf-8")
 
 
 def load_of(true: dict[str, float]) -> float:

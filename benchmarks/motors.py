@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from hil.config.shipped import find_config
 from hil.config.tables import RunConfig, load_toml
+from hil.config.toml import override, read_toml
+from hil.identify.tune import written
 
 Array = npt.NDArray[np.float64]
 NAMES = ("R_s", "L_d", "L_q", "psi_f", "n_p", "J", "B_f", "coulomb", "i_max", "u_max", "w_max")
@@ -29,6 +31,11 @@ MOTORS: dict[str, tuple[float, ...]] = {
     "75 kW surface": (0.020, 0.5e-3, 0.5e-3, 0.40, 4, 0.40, 0.01, 2.5, 300, 310, 160),
     "100 kW interior": (0.012, 0.3e-3, 0.9e-3, 0.36, 4, 0.60, 0.02, 3.0, 400, 310, 180),
 }
+MORE: dict[str, tuple[str, ...]] = {
+    "1.5 kW interior": ('load=[{kind="cogging", torque_n_m=0.05, order=36}]',),
+    "5.5 kW interior": ("coupling={inertia_ratio=1.0, resonance_hz=80.0}",),
+}
+"""What else the plant of a motor has: cogging of half the Coulomb friction, a soft coupling."""
 WRONG = np.array([1.3, 0.7, 1.3, 0.7, 1.0, 1.3, 0.5])
 """What the configuration believes, over the truth."""
 
@@ -44,6 +51,22 @@ def bench(folder: Path, motor: dict[str, float], wrong: Array = WRONG) -> tuple[
         dbc.write_text(text, encoding="utf-8")
     path = folder / "demo.toml"
     return path, load_toml(path, RunConfig, settings(motor, wrong)), plant(motor)
+
+
+def written_bench(folder: Path, motor: dict[str, float], *more: str) -> Path:
+    """The configuration of :func:`bench` as a file, whose emulator is that plant and ``more``."""
+    path, _, _ = bench(folder, motor)
+    rewrite(folder / "plants" / "demo.toml", [*plant(motor), *more])
+    rewrite(path, settings(motor))
+    return path
+
+
+def rewrite(path: Path, texts: list[str]) -> None:
+    """Put settings into a file."""
+    data = read_toml(path)
+    for text in texts:
+        override(data, text, path.parent)
+    path.write_text(written(data, path, path), encoding="utf-8")
 
 
 def settings(motor: dict[str, float], wrong: Array = WRONG) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,6 +16,8 @@ from hil.signals import TickArray
 
 SETTLED: Final = 5
 """Ticks in which a drive's current comes to what is asked for."""
+LOCKS_RAD: Final = math.radians(2.0)
+"""Turn by which a shaft has moved that stands afterwards: noise of the speed adds up to a tenth of it."""
 QUIET: Final = 20
 """Ticks at the start of a step without much current."""
 
@@ -91,8 +94,6 @@ def _fast(own: TickArray) -> float:
 
 def _turns(step: Step, own: TickArray) -> Seen:
     """The shaft must turn, and first the way of the torque, by no other current than is asked for."""
-    if astray := _astray(own):
-        return Seen((astray,))
     peak, current = float(np.abs(own["w"]).max()), float(np.abs(_flowed(own)).max())
     first_way = float(np.sign(step.controller["q"][0]))
     wrong = step.controller["w_wrong_rad_s"]
@@ -100,10 +101,24 @@ def _turns(step: Step, own: TickArray) -> Seen:
     if len(begun) and first_way * float(own["w"][begun[0]]) < 0.0:
         text = "the shaft turns against the torque: phase order or encoder direction is wrong"
         return Seen((f"{text}, or a load drives it",))
+    if astray := _astray(own):
+        return Seen((astray,))
+    pushed = np.abs(own["i_q_ref"]) > 0.9 * float(np.abs(own["i_q_ref"]).max())
+    stands = len(begun) == 0 and abs(float(np.nanmean(own["w"][pushed]))) < 0.1 * wrong
+    angle = _turned(own)
+    if stands and abs(angle) > LOCKS_RAD:
+        text = f"the shaft turns by {math.degrees(angle):.0f} degrees, then stands with {current:.3g} A"
+        return Seen((f"{text}: phase order or encoder direction is wrong, or something holds it",))
     if len(begun) == 0 or peak < 0.1 * abs(step.controller["w_rad_s"][0]):
         text = f"the shaft does not turn with {current:.3g} A: it is blocked, or its load needs more than"
         return Seen((f"{text} limits.i_max_a allows",))
     return Seen()
+
+
+def _turned(own: TickArray) -> float:
+    """By how much the shaft turned [rad], from where it stood at first."""
+    seconds = np.diff(own["t_ns"], append=own["t_ns"][-1:]) * 1e-9
+    return float(np.nansum((own["w"] - np.nanmean(own["w"][:QUIET])) * seconds))
 
 
 def _astray(own: TickArray) -> str:

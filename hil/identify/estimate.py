@@ -12,7 +12,7 @@ import numpy as np
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import SHORTEST, Samples, joined, samples_of, turning
-from hil.identify.fit import Fit, Shaft, bending, fit, frozen
+from hil.identify.fit import Fit, Shaft, bending, first_sigma, fit, frozen
 from hil.identify.inner import InnerFit, evenly
 from hil.identify.model import B_F, COULOMB, L_D, L_Q, LOAD, PSI_F, R_S, SATURATION, Flags, J, unsaturated
 from hil.identify.shaft import calm, rough, times
@@ -27,6 +27,10 @@ EXACT: Final = 5e-4
 """Share of R_s, L, psi_f, J to which a model can be believed: the modulator rounds what it is sent."""
 PLAIN: Final = 0.25
 """Share of the noise's variance by which other pole pairs must fit better: below it noise alone decides."""
+ASTRAY: Final = (0.1, 10.0)
+"""What a fit may leave of the speed: share of its motion within segments, and so many times its noise."""
+J_UNKNOWN: Final = 0.5
+"""Share by which J may be off where no shaft turns freely."""
 BROKEN: Final = 4.0
 """A segment is left out when its speed is so many times further off than the usual one's."""
 
@@ -180,6 +184,13 @@ def _without_disturbed(out: Estimate, samples: Samples, guess: MotorModel) -> tu
 def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) -> Fit:
     """The fit, again without what it shows to be disturbed."""
     found = bent(samples, guess, fit(samples, guess, shaft))
+    if astray(samples, found):
+        out.findings.append(
+            "the speed does not follow the torque as one inertia would: a soft coupling, or a load that "
+            "changes; it tells nothing of J and friction"
+        )
+        samples = replace(samples, free=np.zeros(len(samples), bool))
+        found = bent(samples, guess, fit(samples, guess, Shaft()))
     for _ in range(3):
         size = np.bincount(samples.segment)
         spread = np.sqrt(np.bincount(samples.segment, found.residual[:, 0] ** 2) / size)
@@ -196,6 +207,18 @@ def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) ->
     out.samples, out.fit = samples, found
     out.white = dict(zip(("w", "i_q", "i_d"), (float(p) for p in found.white), strict=True))
     return found
+
+
+def astray(samples: Samples, found: Fit) -> bool:
+    """True when the fit explains little of how a free shaft moves, far beyond the noise of its speed."""
+    free = samples.free
+    if not free.any():
+        return False
+    w, seg = samples.y[free, 0], samples.segment[free]
+    size = np.maximum(np.bincount(seg), 1)
+    motion = float(np.std(w - (np.bincount(seg, w) / size)[seg]))
+    share, times_noise = ASTRAY
+    return bool(found.sigma[0] > max(share * motion, times_noise * float(first_sigma(samples)[0])))
 
 
 def bent(samples: Samples, guess: MotorModel, found: Fit) -> Fit:
@@ -221,14 +244,16 @@ def _as_motor(found: Fit, guess: MotorModel) -> MotorModel:
 
 def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
     fastest = float(np.abs(out.samples.y[:, 0]).max()) if out.samples else 0.0
+    turns = out.samples is not None and bool(out.samples.free.any())
     friction = abs(float(found.value[COULOMB])) + abs(float(found.value[B_F])) * fastest
     for name, place in PLACES.items():
         value, half = float(found.value[place]), float(found.half[place])
-        half = math.hypot(half, EXACT * value)
-        told = half <= TOLD * abs(value)
+        half = math.hypot(half, EXACT * value, _by_inertia(out, found, guess) if place == L_Q else 0.0)
+        least = TOLD * abs(value)
         if place in (B_F, COULOMB, LOAD):  # 0 is a value like any other
-            told = bool(found.told[place] > 0.5)
-            told &= half * (fastest if place == B_F else 1.0) <= max(TOLD * abs(value), 0.1 * friction)
+            least = max(least, 0.1 * friction) / (fastest if place == B_F else 1.0)
+        told = bool(found.told[place] > 0.5) and half <= least
+        told &= turns or place != PSI_F  # a shaft that trembles tells it in ratio to J and L_q
         why = falling(name, value, half, fastest) if told else _why(name)
         out.put(name, value, half, why)
     psi, k = out.parameters["psi_f"], 1.5 * guess.n_p
@@ -244,6 +269,14 @@ def _note_parameters(out: Estimate, found: Fit, guess: MotorModel) -> None:
     load = out.parameters["load"]
     if load.told and abs(load.value) > load.half + 0.05 * abs(out.parameters["coulomb"].value):
         out.findings.append(f"a load of {load.value:.3g} N m acts on the shaft all the time")
+
+
+def _by_inertia(out: Estimate, found: Fit, guess: MotorModel) -> float:
+    """What of L_q [H] rests on a J that nothing tells: n_p psi_f k_t T^2 / (12 J), as the shaft trembles."""
+    if out.samples is None or out.samples.free.any():
+        return 0.0
+    psi_f, T = float(found.value[PSI_F]), out.samples.T_s
+    return J_UNKNOWN * 1.5 * (guess.n_p * psi_f * T) ** 2 / (12.0 * guess.J)
 
 
 def note_saturation(out: Estimate, found: Fit) -> None:

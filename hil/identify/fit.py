@@ -19,7 +19,7 @@ from scipy.stats import t as student
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import Samples
-from hil.identify.model import B_F, COULOMB, LOAD, N_P, PSI_F, SATURATION, outputs, responses
+from hil.identify.model import B_F, COULOMB, LOAD, N_P, PSI_F, SATURATION, J, outputs, responses
 
 WIDE: Final = 3.0
 """Deviation of ln(parameter) before the data: a factor of 20; keeps what they do not tell finite."""
@@ -135,7 +135,10 @@ class Problem:
 
 
 def problem(samples: Samples, motor: MotorModel, shaft: Shaft) -> Problem:
-    """The search around a motor. What runs in one direction alone can't tell a load from friction."""
+    """The search around a motor. What runs in one direction alone can't tell a load from friction.
+
+    Where no shaft turns freely J and B_f stay: there they bend the speed within a period alone, as L_q does.
+    """
     way = np.sign(samples.y[samples.free, 0])
     one_way = len(way) == 0 or bool((way == way[0]).all())
     most = abs(motor.k_t) * max(float(np.abs(samples.y[:, 1]).max()), 1e-9) + shaft.coulomb
@@ -144,6 +147,8 @@ def problem(samples: Samples, motor: MotorModel, shaft: Shaft) -> Problem:
     unit[PSI_F], unit[B_F], unit[COULOMB], unit[LOAD] = abs(motor.psi_f), most / fastest, most, most
     first = np.array([motor.R_s, motor.L_d, motor.L_q, motor.psi_f, motor.J, motor.B_f, shaft.coulomb, 0.0])
     wide = np.array([WIDE, WIDE, WIDE, WIDE, WIDE, 1.0, 1.0, 1e-9 if one_way else 1.0])
+    if len(way) == 0:
+        wide[J] = wide[B_F] = 1e-9
     first[LOAD] = 0.0 if one_way else shaft.load
     if shaft.saturation > 0.0:
         first, unit, wide = np.append(first, shaft.saturation), np.append(unit, 1.0), np.append(wide, WIDE)
@@ -155,7 +160,7 @@ def problem(samples: Samples, motor: MotorModel, shaft: Shaft) -> Problem:
 def fit(samples: Samples, motor: MotorModel, shaft: Shaft, sigma: Array | None = None) -> Fit:
     """The parameters of most likelihood; the outputs' deviations are found too, or begin at ``sigma``."""
     one = problem(samples, motor, shaft)
-    x, weight = one.start, 1.0 / (_first_sigma(samples) if sigma is None else sigma)
+    x, weight = one.start, 1.0 / (first_sigma(samples) if sigma is None else sigma)
     for _ in range(3):
         x = one.solve(x, weight)
         spread = np.sqrt(np.mean((one.residual(x, weight) / weight) ** 2, axis=0))
@@ -172,7 +177,7 @@ def _floor(samples: Samples) -> Array:
     return out
 
 
-def _first_sigma(samples: Samples) -> Array:
+def first_sigma(samples: Samples) -> Array:
     """Noise by the second difference's median."""
     jump = np.median(np.abs(np.diff(samples.y, 2, axis=0)), axis=0) / (0.6745 * np.sqrt(6.0))
     out: Array = np.maximum(jump, 1e-4 * np.abs(samples.y).max(axis=0) + 1e-9)

@@ -8,7 +8,8 @@ In the products the measured w and i_d stand, their mean over the period; all el
 back-EMF carries no noise of the speed. Where L_q saturates, i_q = phi + SATURATION phi^3, phi = psi_q / L_q:
 in di_q/dt stands the secant of psi_q between the measured ends of the period, for psi_q their chord times the
 simulated i_q. That is linear in where a segment starts: each sample is a forced response and one column for
-each start. Where the shaft may stick, the measured speed is taken throughout.
+each start. Where the shaft may stick, each period has the constant load that brings the speed to the measured
+one: between its ends the speed is that of the torque.
 """
 
 from __future__ import annotations
@@ -88,11 +89,11 @@ def inductances(p: Array, before: float, after: float) -> tuple[float, float]:
 
 
 @jit
-def fill_matrix(p: Array, w: float, i_d: float, L: tuple[float, float], free: bool, A: Array) -> None:
-    """A at the speed and the i_d of a period; with the speed given its row is zero. ``L``: of psi_q."""
+def fill_matrix(p: Array, w: float, i_d: float, L: tuple[float, float], A: Array) -> None:
+    """A at the speed and the i_d of a period. ``L``: of psi_q."""
     n_p, (L_q, chord) = p[N_P], L
-    A[0, 0] = -p[B_F] / p[J] if free else 0.0
-    A[0, 1] = 1.5 * n_p * (p[PSI_F] + (p[L_D] - chord) * i_d) / p[J] if free else 0.0
+    A[0, 0] = -p[B_F] / p[J]
+    A[0, 1] = 1.5 * n_p * (p[PSI_F] + (p[L_D] - chord) * i_d) / p[J]
     A[1, 0], A[1, 1], A[1, 2] = -n_p * p[PSI_F] / L_q, -p[R_S] / L_q, -n_p * w * p[L_D] / L_q
     A[2, 1], A[2, 2] = n_p * w * chord / p[L_D], -p[R_S] / p[L_D]
 
@@ -121,18 +122,20 @@ def responses(p: Array, T: float, y: Array, u: Array, begins: Flags, free: Flags
             continue
         w, i_d = 0.5 * (y[k - 1, 0] + y[k, 0]), 0.5 * (y[k - 1, 2] + y[k, 2])
         L = inductances(p, y[k - 1, 1], y[k, 1])
-        fill_matrix(p, w, i_d, L, free[k], A)
+        fill_matrix(p, w, i_d, L, A)
         sampled(A, T, E, I, work)
         way = 1.0 if w > 0.0 else -1.0
-        c[0] = -(p[COULOMB] * way + p[LOAD]) / p[J] if free[k] else (y[k, 0] - y[k - 1, 0]) / T
+        c[0] = -(p[COULOMB] * way + p[LOAD]) / p[J] if free[k] else 0.0
         c[1], c[2] = u[k, 0] / L[0], u[k, 1] / p[L_D]
-        if not free[k]:  # mean of w over the period by both ends and the torque's change: T^2 w'' / 12 less
-            bend = T * 1.5 * p[N_P] * p[PSI_F] / p[J] * (y[k, 1] - y[k - 1, 1]) / 12.0
-            c[1] += p[N_P] * p[PSI_F] * bend / L[0]
         for i in range(3):
             for n in range(4):
                 z[k, n, i] = E[i, 0] * z[k - 1, n, 0] + E[i, 1] * z[k - 1, n, 1] + E[i, 2] * z[k - 1, n, 2]
             z[k, 0, i] += I[i, 0] * c[0] + I[i, 1] * c[1] + I[i, 2] * c[2]
+        if not free[k]:  # by the load that brings the speed to the measured one
+            for n in range(4):
+                load = ((y[k, 0] if n == 0 else 0.0) - z[k, n, 0]) / I[0, 0]
+                for i in range(3):
+                    z[k, n, i] += I[i, 0] * load
 
 
 @jit

@@ -1,4 +1,7 @@
-"""Motors of 50 W to 100 kW that nobody told, identified from simulated runs, within the limits."""
+"""Motors of 50 W to 100 kW that nobody told, identified from simulated runs, within the limits.
+
+One has cogging, one is on a soft coupling.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.motors import MOTORS, NAMES, bench
+from benchmarks.motors import MORE, MOTORS, NAMES, bench
 from hil.identify.estimate import Parameter
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, planned, setup_for
@@ -25,7 +28,7 @@ def test_a_motor_that_nobody_told(tmp_path: Path, name: str) -> None:
     session = Session(path, config, config.motor)
     seconds = 0.0
     for step in planned(session, STEPS):
-        ticks = simulate_ticks(setup_for(session, step), plant)
+        ticks = simulate_ticks(setup_for(session, step), [*plant, *MORE.get(name, ())])
         assert Reason(int(ticks["reason"][-1])) == Reason.STOP_REQUESTED, step.name
         assert np.hypot(ticks["i_q"], ticks["i_d"]).max() < true["i_max"], step.name
         assert np.abs(ticks["w"]).max() < true["w_max"], step.name

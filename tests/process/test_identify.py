@@ -83,7 +83,10 @@ def plant(configs: Path, text: str) -> None:
 
 BLOCKED = '[[load]]\nkind = "brake"\ntorque_n_m = 100.0\n'
 DRIVEN = '[[load]]\nkind = "constant"\ntorque_n_m = 1.5\n'
+FAN = '[[load]]\nkind = "fan"\nk_n_m_s2 = 2.0\n'
 OPEN = '[[fault]]\nkind = "phase-loss"\nat_s = 0.0\n'
+REVERSED = '[[fault]]\nkind = "encoder-reversed"\nat_s = 0.0\n'
+SWAPPED = '[[fault]]\nkind = "phase-swap"\nat_s = 0.0\n'
 SLIP = '[[fault]]\nkind = "encoder-slip"\nangle_deg = 180.0\nat_s = 0.0\n'
 
 
@@ -94,6 +97,11 @@ SLIP = '[[fault]]\nkind = "encoder-slip"\nangle_deg = 180.0\nat_s = 0.0\n'
         ("spinning", DRIVEN, (), "turns against the torque"),
         ("standstill", OPEN, (), "open phase"),
         ("spinning", SLIP, (), "turns against the torque"),
+        ("spinning", REVERSED, (), "turns against the torque: phase order or encoder direction is wrong"),
+        ("spinning", SWAPPED, (), "turns against the torque: phase order or encoder direction is wrong"),
+        ("standstill", REVERSED, (), "encoder counts the wrong way, or two phases are swapped"),
+        ("standstill", SWAPPED, (), "encoder counts the wrong way, or two phases are swapped"),
+        ("spinning", FAN + SWAPPED, (), "degrees, then stands with 7.49 A: phase order or encoder"),
         (
             "standstill,spinning",
             "",
