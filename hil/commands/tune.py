@@ -87,6 +87,8 @@ def cmd_tune(args: argparse.Namespace) -> int:
             "file": str(to),
         }
         show(key_values("hil tune", rows))
+    for line in result["findings"]:
+        say(f"hil: {line}")
     if not result["identified"]:
         say("hil: the motor has no intervals: 30 % are taken; hil identify finds them")
     return 0 if not result["yield"] or result["yield"]["share"] >= 0.9 else EXIT_FAILED

@@ -215,6 +215,8 @@ def cmd_design(args: argparse.Namespace) -> int:
         print_json(found)
     else:
         show(design_table(found))
+    for line in found["findings"]:
+        say(f"hil: {line}")
     return 0 if found.get("verified", {"ok": True})["ok"] else EXIT_FAILED
 
 

@@ -12,9 +12,10 @@ from hil.control.mtpa import POINTS
 
 
 class IdentifiedTable(Table):
-    """What ``hil identify`` adds to a motor: from when and what, 95 % intervals by the motor's keys, noise.
+    """What ``hil identify`` adds to a motor: from when and what, 95 % intervals by the motor's keys, and the
+    facts of bus and sensors.
 
-    No run reads it; ``hil tune`` does.
+    No run reads it; ``hil tune``, ``hil design`` and ``hil check`` do.
     """
 
     date: str
@@ -31,12 +32,28 @@ class IdentifiedTable(Table):
     """Coulomb friction."""
     w_noise_rad_s: NonNegative | None = None
     """Noise of the measured speed, resolution included, standard deviation."""
+    i_q_noise_a: NonNegative | None = None
+    """Noise of the measured i_q, resolution included, standard deviation."""
+    i_d_noise_a: NonNegative | None = None
+    """Noise of the measured i_d, resolution included, standard deviation."""
     i_noise_a: NonNegative | None = None
-    """Noise of the measured currents, resolution included, standard deviation."""
+    """Noise of both currents, of a file that does not tell them apart."""
+    w_lsb_rad_s: NonNegative | None = None
+    """Resolution of the measured speed."""
+    i_q_lsb_a: NonNegative | None = None
+    """Resolution of the measured i_q."""
+    i_d_lsb_a: NonNegative | None = None
+    """Resolution of the measured i_d."""
+    arrival_ms: Finite | None = None
+    """When a measurement comes after its tick's deadline, on average."""
+    arrival_jitter_ms: NonNegative | None = None
+    """Standard deviation of that."""
     L_q_saturation_a: Positive | None = None
     """Current i_q at which psi_q / i_q has fallen to half of L_q_h by saturation; left out: none was seen."""
     delay_ticks: Annotated[int, Field(ge=0, le=100)] | None = None
     """Ticks from sending a voltage to its effect."""
+    echo_lag_ticks: Annotated[int, Field(ge=-100, le=100)] | None = None
+    """Ticks by which the echo of the commands is older than what acts; 0 for an honest one."""
 
 
 class MotorTable(Table):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -20,6 +19,18 @@ KEYS: Final = {
     "B_f": "B_f_n_m_s",
 }
 """Parameters and their keys in the motor's table."""
+FACTS: Final = {
+    "w_noise": ("w_noise_rad_s", 1.0),
+    "i_q_noise": ("i_q_noise_a", 1.0),
+    "i_d_noise": ("i_d_noise_a", 1.0),
+    "w_lsb": ("w_lsb_rad_s", 1.0),
+    "i_q_lsb": ("i_q_lsb_a", 1.0),
+    "i_d_lsb": ("i_d_lsb_a", 1.0),
+    "arrival": ("arrival_ms", 1e3),
+    "arrival_jitter": ("arrival_jitter_ms", 1e3),
+    "L_q_saturation": ("L_q_saturation_a", 1.0),
+}
+"""What else is told, its key in the table ``identified`` and by what it is multiplied there."""
 
 
 def motor_of(found: Estimate, before: MotorTable) -> MotorTable:
@@ -66,15 +77,8 @@ def _extra(found: Estimate) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if "coulomb" in p:
         out["coulomb_n_m"] = number(max(p["coulomb"].value, 0.0))
-    if "w_noise" in p:
-        out["w_noise_rad_s"] = number(p["w_noise"].value)
-    currents = [p[name].value for name in ("i_q_noise", "i_d_noise") if name in p]
-    if currents:
-        out["i_noise_a"] = number(math.hypot(*currents) / math.sqrt(len(currents)))
-    if "L_q_saturation" in p:
-        out["L_q_saturation_a"] = number(p["L_q_saturation"].value)
-    if "delay" in p:
-        out["delay_ticks"] = round(p["delay"].value)
+    out |= {key: number(p[name].value * unit) for name, (key, unit) in FACTS.items() if name in p}
+    out |= {f"{name}_ticks": round(p[name].value) for name in ("delay", "echo_lag") if name in p}
     return out
 
 

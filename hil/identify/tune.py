@@ -7,7 +7,6 @@ a campaign of simulated cases whose motors are drawn from the intervals.
 from __future__ import annotations
 
 import json
-import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +20,7 @@ from hil.config.motor import MotorTable
 from hil.config.tables import RunConfig, validate
 from hil.config.toml import override, read_toml
 from hil.errors import HilError
-from hil.runtime.setup import Overrides, Setup
+from hil.runtime.setup import Overrides
 from hil.tuning.bench import speed_drive
 from hil.tuning.design import Wish, design
 
@@ -52,19 +51,6 @@ def spread_of(motor: MotorTable) -> dict[str, float]:
     return shares
 
 
-def noise_of(setup: Setup) -> dict[str, float]:
-    """The identified noise without the resolution's share, which the bench adds again."""
-    known = setup.config.motor.identified
-    if known is None or known.w_noise_rad_s is None or known.i_noise_a is None:
-        return {}
-    lsb = setup.wire.x_lsb
-
-    def bare(total: float, step: float) -> float:
-        return math.sqrt(max(total**2 - step**2 / 12.0, 0.0))
-
-    return {"w_noise": bare(known.w_noise_rad_s, lsb[0]), "i_noise": bare(known.i_noise_a, max(lsb[1:]) / 2)}
-
-
 def tune(
     path: Path, overrides: Overrides, wish: Wish, load: float | None, cases: int, seen: Callable[[int], None]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -72,14 +58,8 @@ def tune(
     setup = speed_drive(path, overrides)
     motor = setup.config.motor
     known = motor.identified
-    acts_after = 1 + setup.config.drive.delay_ticks
-    if known is not None and known.delay_ticks not in (None, acts_after):
-        raise HilError(
-            f"{path}: the bus delays by {known.delay_ticks} ticks; the laws predict {acts_after}: a lower "
-            "loop.rate_hz, or drive.delay_ticks of a drive with its own current loop"
-        )
-    spread, given = spread_of(motor), {"load": load, **noise_of(setup)}
-    found, best = design(path, overrides, wish, given, spread)
+    spread = spread_of(motor)
+    found, best = design(path, overrides, wish, {"load": load}, spread)
     data = tuned_data(path, overrides, motor, best.tables)
     result = {
         "config": str(path),
@@ -95,6 +75,7 @@ def tune(
         "limited_by": found["limited_by"],
         "limits": limits_in_words(found["limited_by"], setup.config),
         "bench": found["bench"],
+        "findings": found["findings"],
     }
     dip, recovery = float(best.verdict.nominal.dip), float(best.verdict.nominal.recovery_ms)
     result["predicted"] |= {"dip_rad_s": dip, "recovery_ms": recovery}

@@ -19,6 +19,8 @@ from hil.sim.emulate import load_plant
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.measure import Bench
 
+LATEST: Final = 4.0
+"""Deviations of its arrival after which a measurement counts as there: one of 30,000 comes later."""
 QUIET_S: Final = 0.5
 """Time before the load step in which the noise of the command is measured."""
 UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
@@ -26,7 +28,7 @@ UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
 
 
 def speed_drive(path: Path, overrides: Overrides) -> Setup:
-    """The setup of a drive under speed control. Raises HilError for any other law."""
+    """The setup of a drive under speed control. Raises HilError for any other law, or a bus unlike it."""
     setup = load_setup(path, overrides)
     code, kind = int(setup.machine.law["kind"][0]), setup.config.controller.kind
     if code == FAC:
@@ -37,9 +39,69 @@ def speed_drive(path: Path, overrides: Overrides) -> Setup:
         raise HilError(
             f"{path}: controller.kind mtpa: tune it as cascade, whose poles it has, and put them in"
         )
+    check_facts(setup)
     if code not in (CASCADE, PI, SPEED) or setup.machine.law["rows"][0]:
         raise HilError(f"{path}: controller.kind {kind} is no speed control; only that can be tuned")
     return setup
+
+
+def check_facts(setup: Setup) -> None:
+    """Refuse a bus that was identified as another than the laws predict. Raises HilError."""
+    known, acts_after = setup.config.motor.identified, 1 + setup.config.drive.delay_ticks
+    if known is not None and known.delay_ticks not in (None, acts_after):
+        raise HilError(
+            f"{setup.path}: the bus delays by {known.delay_ticks} ticks; the laws predict {acts_after}: a "
+            "lower loop.rate_hz, or drive.delay_ticks of a drive with its own current loop"
+        )
+    if known is not None and known.echo_lag_ticks:
+        raise HilError(
+            f"{setup.path}: the drive's echo is off by {known.echo_lag_ticks} ticks, and the observer goes "
+            "by it: leave drive.signals.echo out, then it goes by what was sent"
+        )
+
+
+def findings_of(setup: Setup) -> list[str]:
+    """What the facts of the bus say of the configuration."""
+    known, loop = setup.config.motor.identified, setup.config.loop
+    if known is None or known.arrival_ms is None or known.arrival_jitter_ms is None or loop.pacing != "sync":
+        return []
+    latest = known.arrival_ms + LATEST * known.arrival_jitter_ms
+    if latest * 1e6 <= loop.timeout_ns:
+        return []
+    return [
+        f"measurements come up to {latest:.3g} ms after the deadline (jitter {known.arrival_jitter_ms:.3g}), "
+        f"later than loop.feedback_timeout_us = {loop.timeout_ns * 1e-3:.0f}: the design has one in each tick"
+    ]
+
+
+def lsb_of(setup: Setup) -> tuple[float, float, float]:
+    """Resolution of w [rad/s], i_q, i_d [A]: the frames', or a coarser one that was identified."""
+    known, (w, i_q, i_d) = setup.config.motor.identified, setup.wire.x_lsb
+    if known is None:
+        return w, i_q, i_d
+    return (
+        max(w, known.w_lsb_rad_s or 0.0),
+        max(i_q, known.i_q_lsb_a or 0.0),
+        max(i_d, known.i_d_lsb_a or 0.0),
+    )
+
+
+def noise_of(setup: Setup, sensors: tuple[float, float], given: dict[str, float]) -> list[float]:
+    """Deviations of w [rad/s], i_q, i_d [A], resolution included: as given, as identified, or the plant's."""
+    known, out = setup.config.motor.identified, []
+    told = (
+        (None, None, None, None)
+        if known is None
+        else (known.w_noise_rad_s, known.i_q_noise_a, known.i_d_noise_a, known.i_noise_a)
+    )
+    rows = (("w_noise", sensors[0], told[0]), *(("i_noise", sensors[1], own or told[3]) for own in told[1:3]))
+    for (name, plants, identified), lsb in zip(rows, lsb_of(setup), strict=True):
+        least = lsb / math.sqrt(12)
+        if name in given or identified is None:
+            out.append(math.hypot(given.get(name, plants), least))
+        else:
+            out.append(max(identified, least))
+    return out
 
 
 def spec_in(setup: Setup) -> LawSpec:
@@ -55,8 +117,9 @@ def takes_voltage(setup: Setup) -> bool:
 def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = None, **more: Any) -> Bench:
     """The bench of a config; ``given`` replaces load [N m], w_noise [rad/s], i_noise [A] of the plant's file.
 
-    The resolution of frames and modulator counts as noise of q / sqrt(12). A soft coupling of the plant's
-    file is the elastic shaft where none is given. Raises HilError.
+    An identified motor brings its own noise, resolution included. Else the resolution of frames and modulator
+    counts as noise of q / sqrt(12). A soft coupling of the plant's file is the elastic shaft where none is
+    given. Raises HilError.
     """
     sensors, load, u_lsb, brake = (0.0, 0.0), None, 0.0, False
     if setup.config.emulator is not None:
@@ -69,7 +132,7 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
             more["shafts"] = (_elastic(plant.masses),)
     own = {name: value for name, value in (given or {}).items() if value is not None}
     more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
-    motor, lsb = motor_model(setup.config.motor), setup.wire.x_lsb
+    motor, (w_noise, i_q_noise, i_d_noise) = motor_model(setup.config.motor), noise_of(setup, sensors, own)
     load = own.get("load", load)
     if load is None:
         load = 0.1 * motor.k_t * setup.config.limits.i_max_a
@@ -77,12 +140,12 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         motor,
         1.0 / setup.config.loop.rate_hz,
         load,
-        math.hypot(own.get("w_noise", sensors[0]), lsb[0] / math.sqrt(12)),
-        math.hypot(own.get("i_noise", sensors[1]), lsb[1] / math.sqrt(12)),
+        w_noise,
+        i_q_noise,
         max(u_lsb, setup.wire.u_lsb) / math.sqrt(12) if takes_voltage(setup) else 0.0,
         _speed(setup),
         brake=brake,
-        i_d_noise=math.hypot(own.get("i_noise", sensors[1]), lsb[2] / math.sqrt(12)),
+        i_d_noise=i_d_noise,
         **more,
     )
 

@@ -20,7 +20,7 @@ import numpy as np
 from hil.control.law import LawSpec
 from hil.errors import HilError
 from hil.runtime.setup import Overrides, Setup
-from hil.tuning.bench import bench_of, spec_in, speed_drive, takes_voltage
+from hil.tuning.bench import bench_of, findings_of, lsb_of, spec_in, speed_drive, takes_voltage
 from hil.tuning.families import Family, family, toml
 from hil.tuning.measure import Bench, margins, noise_text, quiet
 from hil.tuning.optimise import Limits, Tuned, law_of, spec_of, tune
@@ -142,8 +142,8 @@ def design(
         jobs = [pool.submit(_tune, best.family, bench, b, base, wish.effort, "iae", best.x) for b in budgets]
         front = [best, *(job.result() for job in jobs)]
     spec = spec_of(best.tables, base)
-    found = _result(best, front, spec, bench, np.array(setup.wire.x_lsb))
-    found |= {"config": str(path), "wish": asdict(wish)}
+    found = _result(best, front, spec, bench, np.array(lsb_of(setup)))
+    found |= {"config": str(path), "wish": asdict(wish), "findings": findings_of(setup)}
     return found, best
 
 
