@@ -46,6 +46,11 @@ MATCHED = (
     'load=[{kind="step",torque_n_m=5.4,at_s=2.5}]', "friction={}", "sensors={}",
     "inverter={v_dc_v=540.0,resolution_v=0.0}",
 )  # fmt: skip
+BY_FTDOB = (
+    "controller.speed_pole_rad_s=30.0",
+    'observer.speed={kind="ftdob",gamma_1_rad_s=25.0,gamma_2_rad_s=58.0,delay_ms=12.0}',
+)
+"""In place of the shipped design: D = 12 ms."""
 UNTOLD = 'drive.signals.i_q=""'
 SLOW = 'firmware={takes="current",current_loop_rad_s=333.33}'
 AS_TORQUE = (
@@ -56,7 +61,9 @@ AS_TORQUE = (
 
 
 def setup_of(*settings: str) -> Setup:
-    return load_setup(PATH, Overrides(settings=("loop.duration_s=3.2", "reference.down_at_s=9.0", *settings)))
+    return load_setup(
+        PATH, Overrides(settings=("loop.duration_s=3.2", "reference.down_at_s=9.0", *BY_FTDOB, *settings))
+    )
 
 
 def law(inner: InnerLoop, pole: float = 30.0) -> Any:
@@ -281,7 +288,9 @@ def torque_setup(folder: Path, *settings: str) -> Setup:
         (folder / name).symlink_to(CONFIGS / name)
     path = folder / "torque.toml"
     path.write_text(PATH.read_text("utf-8").replace("di_max_a = 5.0", "dtorque_max_n_m = 20.0"), "utf-8")
-    return load_setup(path, Overrides(settings=("loop.duration_s=3.2", "reference.down_at_s=9.0", *settings)))
+    return load_setup(
+        path, Overrides(settings=("loop.duration_s=3.2", "reference.down_at_s=9.0", *BY_FTDOB, *settings))
+    )
 
 
 @pytest.mark.compiled

@@ -42,7 +42,9 @@ EXACT = (  # the plant is what the controller believes in, without dry friction
 
 
 def asked(*settings: str, folder: Path | None = None, ms: float = 5.0, D: float = 20.0) -> Overrides:
-    own = (f"feedback.period_ms={ms}", f"observer.speed.delay_ms={D}", "loop.duration_s=3.2")
+    """With the slow first tuning: the shipped one is for a measurement in each tick."""
+    law = f'observer.speed={{kind="ftdob",gamma_1_rad_s=25.0,gamma_2_rad_s=58.0,delay_ms={D}}}'
+    own = (f"feedback.period_ms={ms}", "controller.speed_pole_rad_s=30.0", law, "loop.duration_s=3.2")
     log = () if folder is None else ('loop.clock="lockstep"', f'log.folder="{folder}"')
     return Overrides(settings=(*own, *log, *settings))
 
@@ -142,13 +144,21 @@ def test_a_tick_waits_for_feedback_when_it_is_due() -> None:
             ("feedback.period_ms=10", "feedback.enable_timeout_s=0.04"),
             "enable_timeout_s = 0.04 come fewer than four measurements",
         ),
-        (ODRIVE, ("feedback.period_ms=10",), "measurements come every 10 ms .*, the states of"),
+        (
+            ODRIVE,
+            ("feedback.period_ms=10", "observer.speed.delay_ms=12"),
+            "measurements come every 10 ms .*, the states of",
+        ),
         (
             ODRIVE,
             ("feedback.period_ms=2", 'loop.pacing="timer"'),
             'with loop.pacing = "timer" the measurements slip',
         ),
-        (CURRENT, ("feedback.period_ms=13",), "every 13 ms .feedback.period_ms., no one in the window"),
+        (
+            CURRENT,
+            ("feedback.period_ms=13", "observer.speed.delay_ms=12"),
+            "every 13 ms .feedback.period_ms., no one in the window",
+        ),
         (CURRENT, ("feedback.period_ms=2", 'bus.sync="kernel"'), 'bus.sync = "kernel" each SYNC is answered'),
         (CONFIGS / "demo.toml", ("feedback.period_ms=2",), "the drive takes voltages"),
         (CONFIGS / "moteus.toml", ("feedback.period_ms=2",), "the drive answers each command"),

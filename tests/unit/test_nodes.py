@@ -47,7 +47,7 @@ def test_each_node_is_a_whole_configuration() -> None:
     assert (motor.config.drive.node_id, load.config.drive.node_id) == (5, 6)
     assert (motor.config.limits.i_max_a, load.config.limits.i_max_a) == (10.0, 3.0)
     assert motor.config.motor == load.config.motor, "what stands at the top is for both"
-    assert motor.config.criteria.dip_max_rad_s == 6.5 and load.config.criteria.dip_max_rad_s is None
+    assert motor.config.criteria.dip_max_rad_s == 2.5 and load.config.criteria.dip_max_rad_s is None
 
 
 def test_a_command_for_one_drive_takes_one_node() -> None:

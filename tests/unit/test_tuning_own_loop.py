@@ -57,6 +57,19 @@ def test_margins_are_those_of_hil_check(name: str) -> None:
     assert own["gain"] == pytest.approx(checked.margins.gain, rel=0.01)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_shipped_design_is_better_than_the_slow_first_one_at_its_noise(name: str) -> None:
+    """docs/drives: with J and psi_f off by 30 %."""
+    slow = (
+        "controller.speed_pole_rad_s=30.0",
+        ('observer.speed={kind="ftdob",gamma_1_rad_s=25.0,gamma_2_rad_s=58.0,delay_ms=12.0}'),
+    )
+    shipped, first = (judge(setup.machine.law, bench) for setup, bench in (drive(name), drive(name, *slow)))
+    assert shipped.u_noise < 1.01 * first.u_noise and shipped.nominal.ms < 1.61 and shipped.worst.ms < 2.2
+    assert shipped.nominal.iae < 0.5 * first.nominal.iae and shipped.worst.iae < 0.65 * first.worst.iae
+    assert shipped.nominal.dip < first.nominal.dip and shipped.worst.dip < first.worst.dip
+
+
 @pytest.mark.parametrize(
     ("name", "corner"),
     [(name, corner) for name in NAMES for corner in ("as believed", "corner 1")] + [("moteus", "corner 4")],
