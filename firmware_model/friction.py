@@ -8,11 +8,25 @@ methods for the control of machines with friction", Automatica 30(7), 1994). Bra
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Final
 
 from firmware_model.jit import jit
 from firmware_model.load import level_of
-from firmware_model.plant import SLIDE, STRIBECK
+from firmware_model.plant import STRIBECK
+
+FAR: Final = 38.0
+"""Speed over w_s at which the exponential is e^-38 = 3.14e-17."""
+LOST: Final = 1.75
+"""Largest (T_s - T_c) / T_c for which that is lost: 1.75 e^-38 < 2^-54, and half an ulp of T_c is more."""
+
+
+@jit
+def dry_above(p: Any, coulomb: float) -> float:
+    """Speed [rad/s] above which friction is T_c to the bit, here ``coulomb``; infinite if there is none."""
+    extra = p["static"] - p["coulomb"]
+    if extra == 0.0:
+        return 0.0
+    return float(FAR * p["stribeck"]) if extra <= LOST * coulomb else math.inf
 
 
 @jit
@@ -25,25 +39,28 @@ def level(p: Any, t: float) -> float:
 
 
 @jit
-def stribeck_coefficient(p: Any, c: Any, k: int) -> float:
-    """Coefficient k of (T_s - T_c) e^{-|w| / w_s} while the shaft slides the way of row SLIDE.
-
-    e = e^{g}, g = -|w| / w_s, from e' = g' e: k e_k = sum_{j=1..k} j g_j e_{k-j}.
-    """
+def stribeck(p: Any, way: float, w: float) -> float:
+    """What (T_s - T_c) e^{-|w| / w_s} takes from dw/dt of a shaft that slides that way; 0 where it sticks."""
     extra = p["static"] - p["coulomb"]
-    if extra == 0.0 or c[SLIDE, 0] == 0.0:
+    if way * extra == 0.0:
         return 0.0
+    return float(way * extra / p["J"] * math.exp(-way * w / p["stribeck"]))
+
+
+@jit
+def stribeck_coefficient(p: Any, c: Any, way: float, k: int) -> float:
+    """Coefficient k of :func:`stribeck`, which goes to row STRIBECK, too."""
     e = c[STRIBECK]
-    e[k] = exponential(-c[SLIDE, 0] / p["stribeck"], c[0], e, k)
-    return float(extra * e[k])
+    e[k] = stribeck(p, way, c[0, 0]) if k == 0 else exponential(-way / p["stribeck"], c[0], e, k)
+    return float(e[k])
 
 
 @jit
 def exponential(rate: float, w: Any, e: Any, k: int) -> float:
-    """Coefficient k of e^{rate w} from those of w and its own before."""
-    if k == 0:
-        return math.exp(rate * w[0])
+    """Coefficient k > 0 of e = e_0 e^{rate (w - w_0)}: k e_k = rate sum_{j=1..k} j w_j e_{k-j}."""
     total = 0.0
-    for j in range(1, k + 1):
-        total += j * rate * w[j] * e[k - j]
-    return total / k
+    for j in range(2, k):
+        total += j * w[j] * e[k - j]
+    if k > 1:
+        total += w[1] * e[k - 1]
+    return float(total * (rate * (1.0 / k)) + w[k] * (rate * e[0]))

@@ -13,7 +13,7 @@ from typing import Any
 
 from firmware_model.jit import jit
 from firmware_model.plant import INVERSE, LINK, POWER
-from firmware_model.series import ORDER, evaluate, first_crossing, product, shifted, within
+from firmware_model.series import ORDER, evaluate, first_crossing, inner, shifted, within
 
 LINK_ERROR_V = 1e-7
 """Last term of the series that a step may have [V]."""
@@ -33,57 +33,65 @@ def link_voltage(p: Any, s: Any) -> float:
 def conducts(p: Any, s: Any, power: float) -> bool:
     """Whether the rectifier feeds the link; at V_0 it depends on where the voltage is going."""
     v = s["v_dc"]
-    drained = power / v + (v / p["brake_resistance"] if s["braking"] else 0.0)
-    return bool(v < p["v_dc"] or (v == p["v_dc"] and drained > 0.0))
+    if v != p["v_dc"]:
+        return bool(v < p["v_dc"])
+    return bool(power / v + (v / p["brake_resistance"] if s["braking"] else 0.0) > 0.0)
+
+
+@jit
+def drain(p: Any, s: Any, fed: bool) -> tuple[float, float, float]:
+    """Of C dv/dt = i_0 - G v - P / v: i_0 / C, G / C and 1 / C."""
+    inverse_C = 1.0 / p["capacitance"]
+    feed = 1.0 / p["rectifier"] if fed else 0.0
+    conductance = feed + (1.0 / p["brake_resistance"] if s["braking"] else 0.0)
+    return feed * p["v_dc"] * inverse_C, conductance * inverse_C, inverse_C
+
+
+@jit
+def link_coefficients(of: Any, power: Any, v: Any, i: Any, k: int) -> tuple[float, float]:
+    """Coefficients k + 1 of v and k of i = 1 / v, from those up to k of P and v, and before k of i.
+
+    Of v i = 1 follows i_k = old - v_k i_0^2, old = -i_0 sum_{0<j<k} v_j i_{k-j}; so dv/dt is linear in v_k.
+    """
+    current, fall, inverse_C = of
+    if k == 0:
+        return current - fall * v[0] - inverse_C * power[0] * i[0], i[0]
+    square, old = i[0] * i[0], -i[0] * inner(v, i, k)
+    rest = power[0] * old + inner(power, i, k) + power[k] * i[0]
+    slope = -(fall - inverse_C * power[0] * square) * v[k] - inverse_C * rest
+    return slope * (1.0 / (k + 1)), old - v[k] * square
 
 
 @jit
 def link_series(p: Any, s: Any, c: Any, fed: bool) -> None:
     """Coefficients of v in row LINK, from those of the motor's power in row POWER."""
-    v, inverse, power = c[LINK], c[INVERSE], c[POWER]
+    v, inverse, of = c[LINK], c[INVERSE], drain(p, s, fed)
     v[0], inverse[0] = s["v_dc"], 1.0 / s["v_dc"]
-    conductance = (1.0 / p["rectifier"] if fed else 0.0) + (
-        1.0 / p["brake_resistance"] if s["braking"] else 0.0
-    )
     for k in range(ORDER):
-        current = -conductance * v[k] - product(power, inverse, k)
-        if k == 0 and fed:
-            current += p["v_dc"] / p["rectifier"]
-        v[k + 1] = current / (p["capacitance"] * (k + 1))
-        total = 0.0
-        for j in range(1, k + 2):
-            total += v[j] * inverse[k + 1 - j]
-        inverse[k + 1] = -total * inverse[0]
+        v[k + 1], inverse[k] = link_coefficients(of, c[POWER], v, inverse, k)
 
 
 @jit
-def link_longer(p: Any, conductance: float, fed: bool, power: Any, v: Any, inverse: Any) -> Any:
+def link_longer(of: Any, power: Any, v: Any, inverse: Any) -> Any:
     """The series v and 1 / v, here tuples, with one coefficient more."""
-    k = len(v) - 1
-    current = -conductance * v[k] - product(power, inverse, k)
-    if k == 0 and fed:
-        current += p["v_dc"] / p["rectifier"]
-    v = (*v, current / (p["capacitance"] * (k + 1)))
-    total = 0.0
-    for j in range(1, k + 2):
-        total += v[j] * inverse[k + 1 - j]
-    return v, (*inverse, -total * inverse[0])
+    more, last = link_coefficients(of, power, v, inverse, len(v) - 1)
+    return (*v, more), (*inverse, last)
 
 
 @jit
 def held_link_series(p: Any, s: Any, power: Any, fed: bool) -> Any:
     """:func:`link_series` as a tuple, of the motor's power as one."""
-    conductance = (1.0 / p["rectifier"] if fed else 0.0) + (
-        1.0 / p["brake_resistance"] if s["braking"] else 0.0
-    )
-    v, inverse = link_longer(p, conductance, fed, power, (s["v_dc"],), (1.0 / s["v_dc"],))
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, inverse = link_longer(p, conductance, fed, power, v, inverse)
-    v, _ = link_longer(p, conductance, fed, power, v, inverse)
+    of = drain(p, s, fed)
+    v_0 = s["v_dc"]
+    more, last = link_coefficients(of, power, (v_0,), (1.0 / v_0,), 0)
+    v, inverse = (v_0, more), (last,)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, inverse = link_longer(of, power, v, inverse)
+    v, _ = link_longer(of, power, v, inverse)
     return v
 
 

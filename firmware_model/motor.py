@@ -14,35 +14,44 @@ section I.8). A substep h leaves a relative error of about (r h)^9 / 9!, r = n_p
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from firmware_model.coupling import far_end, twisted
-from firmware_model.friction import exponential, level, stribeck_coefficient
+from firmware_model.friction import exponential, level, stribeck, stribeck_coefficient
 from firmware_model.jit import jit
 from firmware_model.load import held_load, varying_load
 from firmware_model.plant import ANGLE, DRIVE, SLIDE
 from firmware_model.saturation import begin_flux, bend, current_of
-from firmware_model.series import ORDER, evaluate, integral, products
+from firmware_model.series import ORDER, evaluate, inner, integral, product
 
 
 @jit
 def constants(p: Any) -> Any:
-    """What :func:`slopes` takes of the motor, 1/J, 1/L_q and 1/L_d last."""
-    n_p, L_d, L_q = p["n_p"], p["L_d"], p["L_q"]
-    k_t, reluctance = 1.5 * n_p * p["psi_f"], 1.5 * n_p * (L_d - L_q)
-    return n_p, p["R_s"], L_d, L_q, p["psi_f"], p["B_f"], k_t, reluctance, 1.0 / p["J"], 1.0 / L_q, 1.0 / L_d
+    """What :func:`slopes` multiplies by, of dw/dt, di_q/dt and di_d/dt; 1/J, 1/L_q and 1/L_d last."""
+    n_p, L_d, L_q, k_t = p["n_p"], p["L_d"], p["L_q"], 1.5 * p["n_p"] * p["psi_f"]
+    J, q, d = 1.0 / p["J"], 1.0 / L_q, 1.0 / L_d
+    of_w = k_t * J, 1.5 * n_p * (L_d - L_q) * J, p["B_f"] * J
+    of_q = p["R_s"] * q, n_p * p["psi_f"] * q, n_p * L_d * q
+    return *of_w, *of_q, p["R_s"] * d, n_p * L_q * d, J, q, d
 
 
 @jit
 def slopes(m: Any, w: Any, q: Any, d: Any, k: int) -> tuple[float, float, float]:
-    """Coefficient k of dw/dt, di_q/dt, di_d/dt as far as they follow from w, i_q and i_d."""
-    n_p, R_s, L_d, L_q, psi_f, B_f, k_t, reluctance, inverse_J, inverse_q, inverse_d = m
-    wq, wd, qd = products(w, q, d, k)
-    T = k_t * q[k] + reluctance * qd - B_f * w[k]
-    v_q = -R_s * q[k] - n_p * (L_d * wd + psi_f * w[k])
-    v_d = -R_s * d[k] + n_p * L_q * wq
-    return T * inverse_J, v_q * inverse_q, v_d * inverse_d
+    """Coefficient k of dw/dt, di_q/dt, di_d/dt as far as they follow from w, i_q and i_d.
+
+    What is of order k is linear in the newest coefficients, with slopes that all orders share.
+    """
+    torque, reluctance, drag, fall_q, emf, cross_q, fall_d, cross_d = m[:8]
+    dw = torque * q[k] - drag * w[k]
+    if reluctance != 0.0:
+        dw += reluctance * product(q, d, k)
+    if k == 0:
+        dq = -fall_q * q[0] - (emf + cross_q * d[0]) * w[0]
+        return dw, dq, cross_d * w[0] * q[0] - fall_d * d[0]
+    old_q, old_d = -cross_q * inner(w, d, k), cross_d * inner(w, q, k)
+    dq = (old_q - fall_q * q[k]) - ((emf + cross_q * d[0]) * w[k] + (cross_q * w[0]) * d[k])
+    dd = (old_d - fall_d * d[k]) + ((cross_d * w[0]) * q[k] + (cross_d * q[0]) * w[k])
+    return dw, dq, dd
 
 
 @jit
@@ -59,15 +68,16 @@ def series(
     """Coefficients of w, i_q, i_d [unit / s^k] about t [s] in rows 0 to 2 of ``c``, for a step of h [s].
 
     With the gates off no current flows and only the shaft moves. With friction the shaft slides the way that
-    row SLIDE says, or sticks; what drives it then goes to row DRIVE. A soft coupling has its own two rows.
+    row SLIDE says, with or without Stribeck's part, or sticks; what drives it then goes to row DRIVE. A soft
+    coupling has its own two rows.
     """
     m = constants(p)
     inverse_J = m[-3]
     w, q, d = c[0], c[1], c[2]
     w[0], q[0], d[0] = x[0], x[1], x[2]
     soft, T_held = p["J_load"] > 0.0, held_load(p, t + 0.5 * h) + T_commanded
-    added = held(p, m, 0.0 if soft else T_held, u_q, u_d)
     slide, T_coulomb = (c[SLIDE, 0], level(p, t + 0.5 * h)) if p["rubs"] else (1.0, 0.0)
+    added = held(p, m, (0.0 if soft else T_held) + slide * T_coulomb, u_q, u_d)
     saturates = p["L_q_saturation"] > 0.0
     if saturates:
         begin_flux(p, c)
@@ -75,7 +85,7 @@ def series(
         share = 1.0 / (k + 1)
         dw, dq, dd = slopes(m, w, q, d, k)
         if saturates:
-            bent_w, bent_d = bend(m, c, k)
+            bent_w, bent_d = bend(p, m, c, k)
             dw, dd = dw + bent_w, dd + bent_d
         if p["varying"]:
             T_L, T_angle = varying_load(p, c, t, k)
@@ -85,11 +95,10 @@ def series(
             dw -= T_L * inverse_J
         if k == 0:
             dw, dq, dd = dw + added[0], dq + added[1], dd + added[2]
-        if p["rubs"]:
-            if slide == 0.0:
-                c[DRIVE, k] = dw / inverse_J
-            dw -= slide * ((T_coulomb if k == 0 else 0.0) + stribeck_coefficient(p, c, k)) * inverse_J
-            dw *= abs(slide)
+        if slide == 0.0:
+            c[DRIVE, k], dw = dw / inverse_J, 0.0
+        elif p["rubs"] and c[SLIDE, 1] != 0.0:
+            dw -= stribeck_coefficient(p, c, slide, k)
         w[k + 1] = dw * share
         q[k + 1], d[k + 1] = (dq * share, dd * share) if on else (0.0, 0.0)
         if saturates:
@@ -128,31 +137,36 @@ def plain_series(p: Any, x: Any, T_held: float, u_q: float, u_d: float, on: bool
 
 @jit
 def rubbed(m: Any, added: Any, friction: Any, on: bool, w: Any, q: Any, d: Any, e: Any) -> Any:
-    """:func:`longer` for a shaft with ``friction``: (way that it slides or 0, T_c, T_s - T_c, -way / w_s).
+    """:func:`longer` for a shaft with ``friction``: (way that it slides or 0, -way / w_s).
 
-    So does ``e`` = e^{-|w| / w_s}; last comes coefficient k of what drives a shaft that sticks.
+    So does ``e``, what Stribeck's part takes from dw/dt; last comes coefficient k of what drives a shaft that
+    sticks.
     """
     k, inverse_J = len(w) - 1, m[-3]
-    slide, T_coulomb, extra, rate = friction
+    slide, rate = friction
     dw, dq, dd = slopes(m, w, q, d, k)
     if k == 0:
         dw, dq, dd = dw + added[0], dq + added[1], dd + added[2]
-    drive = dw / inverse_J if slide == 0.0 else 0.0
-    dw -= slide * ((T_coulomb if k == 0 else 0.0) + extra * e[k]) * inverse_J
-    dw *= abs(slide)
+    drive = 0.0
+    if slide == 0.0:
+        drive, dw = dw / inverse_J, 0.0
+    else:
+        dw -= e[k]
     share = 1.0 / (k + 1)
     dq, dd = (dq * share, dd * share) if on else (0.0, 0.0)
     w = (*w, dw * share)
-    fall = exponential(rate, w, e, k + 1) if slide * extra != 0.0 else 0.0
-    return w, (*q, dq), (*d, dd), (*e, fall), drive
+    return w, (*q, dq), (*d, dd), (*e, exponential(rate, w, e, k + 1)), drive
 
 
 @jit
 def rubbed_series(p: Any, x: Any, T_held: float, u_q: float, u_d: float, on: bool, friction: Any) -> Any:
-    """:func:`series` with friction and without loads that vary, as tuples: w, i_q, i_d and what drives."""
-    m, (slide, _, extra, rate) = constants(p), friction
+    """:func:`series` with friction and without loads that vary, as tuples: w, i_q, i_d and what drives.
+
+    ``T_held`` has Coulomb's part of it.
+    """
+    m = constants(p)
     added = held(p, m, T_held, u_q, u_d)
-    e = (math.exp(rate * x[0]) if slide * extra != 0.0 else 0.0,)
+    e = (stribeck(p, friction[0], x[0]),)
     w, q, d, e, drive_0 = rubbed(m, added, friction, on, (x[0],), (x[1],), (x[2],), e)
     w, q, d, e, drive_1 = rubbed(m, added, friction, on, w, q, d, e)
     w, q, d, e, drive_2 = rubbed(m, added, friction, on, w, q, d, e)

@@ -11,17 +11,17 @@ import math
 from typing import Any
 
 from firmware_model.coupling import coupling_torque
-from firmware_model.friction import level
+from firmware_model.friction import dry_above, level
 from firmware_model.jit import jit
 from firmware_model.link import advance_held_link, advance_link
 from firmware_model.load import held_load, load_torque, turned_load
-from firmware_model.motor import arrive, rubbed_series, series
-from firmware_model.plant import ANGLE, DRIVE, LOAD_SPEED, POWER, SLIDE, STRIBECK, TWIST
+from firmware_model.motor import arrive, plain_series, rubbed_series, series
+from firmware_model.plant import ANGLE, DRIVE, LOAD_SPEED, POWER, SLIDE, TWIST
 from firmware_model.saturation import flux_of
-from firmware_model.series import ORDER, evaluate, first_crossing, integral, within
+from firmware_model.series import ORDER, evaluate, first_crossing, integral, stays_clear, within
 
 W_ERROR = 1e-10
-"""Last term of the series of w [rad/s], and of the Stribeck exponential, that a step may have."""
+"""Last term of the series of w [rad/s] that a step may have."""
 BREAKS = 1.0 - 1e-12
 """Share of T_s at which the shaft breaks away: where a series was cut there, rounding may be short of it."""
 PIECES = 1000
@@ -51,7 +51,9 @@ def friction_torque(p: Any, s: Any, t: float) -> float:
     if w == 0.0:
         most = coulomb + extra
         return float(min(max(drive_torque(p, s, t), -most), most))
-    size = coulomb + extra * math.exp(-abs(w) / p["stribeck"])
+    size = coulomb  # to the bit
+    if abs(w) <= dry_above(p, coulomb):
+        size += extra * math.exp(-abs(w) / p["stribeck"])
     return float(size if w > 0.0 else -size)
 
 
@@ -59,45 +61,40 @@ def friction_torque(p: Any, s: Any, t: float) -> float:
 def slide(p: Any, s: Any, t: float, h: float, most: float, on: bool) -> None:
     """Compute the series for the way that the shaft slides, or for a shaft that sticks."""
     w, c = s["x"][0], s["series"]
-    c[SLIDE, 0] = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0)
+    way = c[SLIDE, 0] = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0)
+    far = dry_above(p, level(p, t + 0.5 * h))
+    c[SLIDE, 1] = 0.0 if way * w > far else 1.0
     series(p, s["x"], c, t, h, s["u_q"], s["u_d"], s["T_commanded"], on)
-    if p["rubs"] and w == 0.0 and abs(c[DRIVE, 0]) >= most * BREAKS:
+    if not p["rubs"]:
+        return
+    if c[SLIDE, 1] == 0.0 and not stays_clear(c[0], way * far, within(c[0], h, W_ERROR)):
+        c[SLIDE, 1] = 1.0
+        series(p, s["x"], c, t, h, s["u_q"], s["u_d"], s["T_commanded"], on)
+    if w == 0.0 and abs(c[DRIVE, 0]) >= most * BREAKS:
         c[SLIDE, 0] = 1.0 if c[DRIVE, 0] > 0.0 else -1.0
         series(p, s["x"], c, t, h, s["u_q"], s["u_d"], s["T_commanded"], on)
 
 
 @jit
-def piece(p: Any, c: Any, most: float, left: float) -> float:
+def piece(w: Any, drive: Any, way: float, most: float, left: float) -> float:
     """How far the series holds: to its accuracy, to where w reaches 0, or to where the drive exceeds T_s."""
-    if c[SLIDE, 0] == 0.0:
-        c[DRIVE, ORDER] = 0.0
-        return min(left, first_crossing(c[DRIVE], most, left), first_crossing(c[DRIVE], -most, left))
-    step = within(c[0], left, W_ERROR)
-    if p["static"] > p["coulomb"]:
-        step = min(within(c[STRIBECK], left, W_ERROR), step)
-    return min(step, first_crossing(c[0], 0.0, step))
-
-
-@jit
-def slid(p: Any, s: Any, t: float, h: float, most: float, on: bool) -> Any:
-    """:func:`slide` without loads that vary: w, i_q, i_d, what drives, and the way that the shaft slides."""
-    w, T_held, T_coulomb = s["x"][0], held_load(p, t + 0.5 * h) + s["T_commanded"], level(p, t + 0.5 * h)
-    way, extra = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0), p["static"] - p["coulomb"]
-    while True:
-        friction = way, T_coulomb, extra, -way / p["stribeck"]
-        a, q, d, drive = rubbed_series(p, s["x"], T_held, s["u_q"], s["u_d"], on, friction)
-        if way != 0.0 or not abs(drive[0]) >= most * BREAKS:
-            return a, q, d, drive, way
-        way = 1.0 if drive[0] > 0.0 else -1.0
-
-
-@jit
-def slid_piece(w: Any, drive: Any, way: float, most: float, left: float) -> float:
-    """:func:`piece` of :func:`slid`."""
     if way == 0.0:
         return min(left, first_crossing(drive, most, left), first_crossing(drive, -most, left))
     step = within(w, left, W_ERROR)
     return min(step, first_crossing(w, 0.0, step))
+
+
+@jit
+def slid(p: Any, s: Any, T_held: float, T_coulomb: float, most: float, on: bool) -> Any:
+    """:func:`slide` near rest, without loads that vary: w, i_q, i_d, what drives, and the way it slides."""
+    w = s["x"][0]
+    way = 0.0 if w == 0.0 else (1.0 if w > 0.0 else -1.0)
+    while True:
+        T, friction = T_held + way * T_coulomb, (way, -way / p["stribeck"])
+        a, q, d, drive = rubbed_series(p, s["x"], T, s["u_q"], s["u_d"], on, friction)
+        if way != 0.0 or not abs(drive[0]) >= most * BREAKS:
+            return a, q, d, drive, way
+        way = 1.0 if drive[0] > 0.0 else -1.0
 
 
 @jit
@@ -120,20 +117,33 @@ def power_of(u_q: float, u_d: float, q: Any, d: Any, on: bool) -> Any:
 
 @jit
 def rub_held(p: Any, s: Any, t: float, h: float, on: bool) -> None:
-    """:func:`rub` without loads that vary: as tuples, as :func:`firmware_model.motor.plain_series` is."""
+    """:func:`rub` without loads that vary: as tuples, as :func:`firmware_model.motor.plain_series` is.
+
+    A shaft that is free, or so fast that friction is T_c to the bit, has the series of one under a load.
+    """
     x, left = s["x"], h
-    most = level(p, t + 0.5 * h) + p["static"] - p["coulomb"]
+    T_held, T_coulomb = held_load(p, t + 0.5 * h) + s["T_commanded"], level(p, t + 0.5 * h)
+    most, far = T_coulomb + p["static"] - p["coulomb"], dry_above(p, T_coulomb)
     for n in range(PIECES):
-        w, q, d, drive, way = slid(p, s, t, left, most, on)
-        step = slid_piece(w, drive, way, most, left) if n < PIECES - 1 else left
+        way, step, done = (1.0 if x[0] > 0.0 else -1.0), left, False
+        if not p["rubs"] or way * x[0] > far:
+            w, q, d = plain_series(p, x, T_held + way * T_coulomb, s["u_q"], s["u_d"], on)
+            if p["rubs"]:
+                step = within(w, left, W_ERROR)
+            done = not p["rubs"] or stays_clear(w, way * far, step)
+        if not done:
+            w, q, d, drive, way = slid(p, s, T_held, T_coulomb, most, on)
+            step = piece(w, drive, way, most, left)
+        if n == PIECES - 1:
+            step = left
         x[0], x[1], x[2] = evaluate(w, step), evaluate(q, step), evaluate(d, step)
-        if way * x[0] <= 0.0:
+        if p["rubs"] and way * x[0] <= 0.0:
             x[0] = 0.0
         if p["turns"]:
             s["series"][ANGLE, 0] += integral(w, step)
         if p["capacitance"] > 0.0:
             advance_held_link(p, s, s["series"], power_of(s["u_q"], s["u_d"], q, d, on), step)
-        t, left = t + step, left - step
+        left -= step
         if left <= 0.0:
             return
 
@@ -141,14 +151,17 @@ def rub_held(p: Any, s: Any, t: float, h: float, on: bool) -> None:
 @jit
 def rub(p: Any, s: Any, t: float, h: float, on: bool) -> None:
     """Advance motor and DC link from t [s] by h [s]."""
-    if p["rubs"] and not p["varying"]:
+    if not p["varying"]:
         rub_held(p, s, t, h, on)
         return
     x, c, left = s["x"], s["series"], h
     most = level(p, t + 0.5 * h) + p["static"] - p["coulomb"]
     for n in range(PIECES):
         slide(p, s, t, left, most, on)
-        step = piece(p, c, most, left) if p["rubs"] and n < PIECES - 1 else left
+        step = left
+        if p["rubs"] and n < PIECES - 1:
+            c[DRIVE, ORDER] = 0.0
+            step = piece(c[0], c[DRIVE], c[SLIDE, 0], most, left)
         for k in range(ORDER + 1):
             c[POWER, k] = 1.5 * (s["u_q"] * c[1, k] + s["u_d"] * c[2, k]) if on else 0.0
         arrive(p, x, c, step)

@@ -38,9 +38,9 @@ def begin_flux(p: Any, c: Any) -> None:
 
 
 @jit
-def bend(m: Any, c: Any, k: int) -> tuple[float, float]:
+def bend(p: Any, m: Any, c: Any, k: int) -> tuple[float, float]:
     """What saturation adds to coefficient k of dw/dt and di_d/dt."""
-    reach, inverse_J, inverse_d = m[0] * m[3], m[-3], m[-1]
+    reach, inverse_J, inverse_d = p["n_p"] * p["L_q"], m[-3], m[-1]
     torque, emf = product(c[EXCESS], c[2], k), product(c[0], c[EXCESS], k)
     return 1.5 * reach * torque * inverse_J, -reach * emf * inverse_d
 

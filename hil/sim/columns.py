@@ -13,6 +13,8 @@ from hil.control.jit import jit
 from hil.signals import new_ticks
 
 ROWS: Final = 8192
+APART: Final = 8
+"""Rows that stay unused: columns a power of two apart share few places of the processor's nearest memory."""
 RING: Final = 128
 """Records that are written in turn: few, so that they stay in the processor's nearest memory."""
 FLOATS: Final = ("w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat")
@@ -34,12 +36,12 @@ def gather(ticks: Any, floats: Any, integers: Any, at: int) -> None:
 
 
 class Columns:
-    """Some ticks' fields by name, in room for :data:`ROWS`; ``stop``: a run's first tick with a reason."""
+    """Some ticks' fields by name, in room for ``rows``; ``stop``: a run's first tick with a reason."""
 
     def __init__(self, rows: int = ROWS) -> None:
-        self.ring, self.stop, self.count = new_ticks(RING), new_ticks(), 0
-        self.floats = np.empty((len(FLOATS), rows))
-        self.integers = np.empty((len(INTEGERS), rows), np.int64)
+        self.ring, self.stop, self.count, self.rows = new_ticks(RING), new_ticks(), 0, rows
+        self.floats = np.empty((len(FLOATS), rows + APART))
+        self.integers = np.empty((len(INTEGERS), rows + APART), np.int64)
         self._of: dict[str, Any] = dict(zip(FLOATS, self.floats, strict=True))
         self._of |= dict(zip(INTEGERS, self.integers, strict=True))
 

@@ -39,7 +39,7 @@ from hil.runtime.refusals import needed_bytes
 from hil.runtime.session import plan_of
 from hil.runtime.setup import Setup
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, RxFlag, TickArray, new_ticks
-from hil.sim.columns import Columns, gather
+from hil.sim.columns import APART, Columns, gather
 from hil.sim.emulate import load_plant
 from hil.tick.guard import NO_ANGLE, NO_I_D, NO_I_Q, SAFETY_PARAMS, SAFETY_STATE
 from hil.tick.kernel import step
@@ -128,10 +128,10 @@ def simulate_block(
     """Run ticks k, k + 1, ... into ``ticks``; return how many, fewer than its length when the run ended.
 
     ``tick`` is the one before the first: what a tick does not write it has from the one before. Where
-    ``floats`` and ``integers`` have columns (:mod:`hil.sim.columns`), it is as many as these have: the
-    records are written in turn then, and their fields gathered; the first with a reason goes to ``stop``.
+    ``floats`` and ``integers`` have columns (:mod:`hil.sim.columns`), it is as many as these have room for:
+    the records are written in turn then, their fields gathered; the first with a reason goes to ``stop``.
     """
-    before, size, columns = tick, ticks.shape[0], floats.shape[1]
+    before, size, columns = tick, ticks.shape[0], floats.shape[1] - APART
     for i in range(max(size, columns)):
         j = i % size
         if k + i > 0:
@@ -193,7 +193,7 @@ class Simulation:
             room.count = advance_into(room.ring, k)
             yield room
             k += room.count
-            if room.count < room.floats.shape[1] or is_over(room.last()):
+            if room.count < room.rows or is_over(room.last()):
                 return
 
     def warm_up(self) -> None:

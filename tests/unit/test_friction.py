@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 from firmware_model.config import Inverter, PlantConfig, Wire, build_params, new_state
 from firmware_model.drive import advance
+from firmware_model.friction import dry_above
 from firmware_model.plant import ORDER, ErrorCode, State
 from firmware_model.rub import friction_torque
 from firmware_model.series import LOOKS, evaluate, first_crossing, stays_clear
@@ -60,6 +61,18 @@ def stopped(p: Any, x: list[float], on: bool = True) -> Any:
     rest.terminal = True  # type: ignore[attr-defined]
     of = rate(p, 1.0, on)
     return solve_ivp(of, (0, 1), x, "DOP853", events=rest, args=(0.0,), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("coulomb", [0.1, 0.3, 0.4, 0.499, 1.0, 3.0])
+def test_far_from_rest_friction_is_coulombs_to_the_bit(coulomb: float) -> None:
+    """And a torque of Stribeck's that is too large beside Coulomb's to be lost is never left out."""
+    for extra in (0.0, 0.2 * coulomb, 1.74 * coulomb, 1.76 * coulomb, 1e6 * coulomb):
+        friction = {"coulomb_n_m": coulomb, "static_n_m": coulomb + extra, "stribeck_rad_s": 1.5}
+        p, _ = plant(friction=friction)
+        far = dry_above(p, p["coulomb"])
+        assert far == (0.0 if extra == 0.0 else 57.0 if extra < 1.75 * coulomb else math.inf)
+        if far < math.inf:
+            assert coulomb + extra * math.exp(-far / 1.5) == coulomb
 
 
 def test_a_shaft_that_coasts_stops_in_time_and_rests_to_the_bit() -> None:
@@ -174,7 +187,9 @@ def test_series_as_tuples_and_in_their_room_give_the_same_bits(static: float, in
     p, s = plant(friction=friction, load=[brake], inverter=inverter, seed=1)
     general, other = plant(friction=friction, load=[brake], inverter=inverter, seed=1)
     general["varying"] = 1
-    s["x"][0] = other["x"][0] = 30.0
+    s["x"][0] = other["x"][0] = 75.0
+    far, near = dry_above(p, p["coulomb"]), 0
+    assert far == 38.0 * 1.5 if static == 0.9 else far == 0.0
     signs, links = set(), set()
     for k in range(300):  # to and fro and at rest, the gates off at times; often enough to brake
         u_q = (40.0, 2.6, 90.0, 1.0, -60.0, -2.0, 3.0, 120.0, -120.0, 0.0)[k // 30]
@@ -188,9 +203,11 @@ def test_series_as_tuples_and_in_their_room_give_the_same_bits(static: float, in
         advance(general, other, 1_000_000)
         assert s["x"].tobytes() == other["x"].tobytes(), k
         assert (s["v_dc"], s["braking"]) == (other["v_dc"], other["braking"]), k
+        near += abs(s["x"][0]) <= far
         signs.add(float(np.sign(s["x"][0])))
         links.add((float(s["v_dc"]), int(s["braking"])))
     assert signs == {-1.0, 0.0, 1.0}
+    assert 0 < near < 300, "with Stribeck's part, and where it is lost"
     brakes = inverter.get("capacitance_f") == 2e-5
     assert len(links) > 100 if inverter else len(links) == 1
     assert {braking for _, braking in links} == ({0, 1} if brakes else {0})
