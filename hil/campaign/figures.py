@@ -17,7 +17,7 @@ import numpy as np
 from hil.campaign.margins import DESIGN
 from hil.config.limits import LimitsTable
 from hil.config.tables import RunConfig
-from hil.report.criteria import FIGURES, check_limit, demanded
+from hil.report.criteria import FIGURES, check_limit, demanded, outcome_of
 from hil.report.curves import F8
 from hil.report.excursions import Excursions
 from hil.report.segments import Responses, largest
@@ -39,6 +39,10 @@ NAMES: Final = {f.key: f"{f.name}{f', {f.unit}' if f.unit else ''}" for f in FIG
 
 NO_PHASES: Final = Phases()
 """A simulation has none."""
+
+
+wanted = lru_cache(maxsize=64)(demanded)
+"""What criteria demand; most cases of a campaign share them."""
 
 
 @lru_cache(maxsize=8)
@@ -111,15 +115,12 @@ class Judged:
             follows=self.config.controller.kind != "torque",
         )
         found = {figure.key: figure.of(run) for figure in FIGURES} | self._added(self.config.limits)
-        limits = demanded(self.config.criteria)
-        checks = [check_limit(run, f, limits[f.key]) for f in FIGURES if f.key in limits]
-        verdicts = {f"criteria:{key}": check.outcome for key, check in zip(limits, checks, strict=True)}
-        good = self.reason == Reason.STOP_REQUESTED and all(c.outcome == "pass" for c in checks)
-        why = (
-            ""
-            if good
-            else "; ".join(f"{c.name}: {c.found}, {c.wanted}" for c in checks if c.outcome != "pass")
-        )
+        limits = wanted(self.config.criteria)
+        verdicts = {f"criteria:{key}": outcome_of(found[key], most) for key, most in limits.items()}
+        bad = [f for f in FIGURES if f.key in limits and verdicts[f"criteria:{f.key}"] != "pass"]
+        good = self.reason == Reason.STOP_REQUESTED and not bad
+        checks = [check_limit(run, figure, limits[figure.key]) for figure in bad]
+        why = "; ".join(f"{c.name}: {c.found}, {c.wanted}" for c in checks)
         if self.reason != Reason.STOP_REQUESTED:
             why = f"ended by {ended.replace('_', ' ')} at {self.totals.ticks * self._period_s:.3f} s"
         return {"ended": ended, "passed": good, "why": why} | found | verdicts

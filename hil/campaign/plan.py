@@ -19,7 +19,6 @@ from typing import Annotated, Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from scipy.stats import qmc
 
 from hil.campaign.normal import normal, root
 from hil.campaign.values import FORMS, NAMES, Distribution, corners, distribution, number
@@ -156,7 +155,11 @@ class Plan:
     def split(self, case: int) -> tuple[tuple[int, ...], int]:
         """Place on each axis of :attr:`sizes`, and the sample."""
         place, sample = divmod(case, 1 if self.samples is None else self.samples)
-        return tuple(int(i) for i in np.unravel_index(place, self.sizes)), sample
+        places = []
+        for size in reversed(self.sizes):
+            place, at = divmod(place, size)
+            places.append(at)
+        return tuple(reversed(places)), sample
 
     def variant(self, case: int) -> str:
         """Name of the case's variant; empty where there are none."""
@@ -192,9 +195,19 @@ class Plan:
 
 def _raw(seed: int, stream: int, count: int, sample: int) -> npt.NDArray[np.uint64]:
     """``count`` words of the counter-based generator Philox at the place of a sample."""
-    blocks = -(-count // 4)
-    generator = np.random.Philox(key=seed, counter=[sample * blocks, stream, 0, 0])
-    words: npt.NDArray[np.uint64] = generator.random_raw(count)
+    block, row = divmod(sample, RAW)
+    return _raw_block(seed, stream, -(-count // 4), block)[row, :count]
+
+
+RAW: Final = 256
+"""Samples whose words are drawn at once: neighbours are wanted next, and to begin takes the longest."""
+
+
+@lru_cache(maxsize=8)
+def _raw_block(seed: int, stream: int, blocks: int, block: int) -> npt.NDArray[np.uint64]:
+    """So many times four words of Philox for each of :data:`RAW` samples."""
+    generator = np.random.Philox(key=seed, counter=[block * RAW * blocks, stream, 0, 0])
+    words: npt.NDArray[np.uint64] = generator.random_raw(RAW * 4 * blocks).reshape(RAW, -1)
     return words
 
 
@@ -215,6 +228,8 @@ BLOCK: Final = 1024
 
 @lru_cache(maxsize=2)
 def _hypercube(seed: int, count: int, samples: int) -> F8:
+    from scipy.stats import qmc  # half a second, which few plans need
+
     points: F8 = qmc.LatinHypercube(count, rng=np.random.default_rng(seed)).random(samples)
     return points
 
@@ -222,6 +237,8 @@ def _hypercube(seed: int, count: int, samples: int) -> F8:
 @lru_cache(maxsize=4)
 def _sobol(seed: int, count: int, block: int) -> F8:
     """A block of points of Owen's scrambled sequence."""
+    from scipy.stats import qmc  # as above
+
     sequence = qmc.Sobol(count, scramble=True, rng=np.random.default_rng(seed))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that a part of the sequence is not balanced

@@ -191,10 +191,15 @@ def judge(run: Run) -> list[Check]:
     return [*_always(run), *(check_limit(run, f, most[f.key]) for f in FIGURES if f.key in most)]
 
 
+def outcome_of(value: float | None, most: float) -> Outcome:
+    """The verdict on a figure that may be ``most``."""
+    return "no data" if value is None else "pass" if value <= most else "fail"
+
+
 def check_limit(run: Run, figure: Figure, most: float) -> Check:
     """The check of one figure."""
     value = figure.of(run)
-    outcome: Outcome = "no data" if value is None else "pass" if value <= most else "fail"
+    outcome = outcome_of(value, most)
     note = notes(run).get(figure.key)
     found = number(value, figure.unit) + (f" ({note})" if note else "")
     return Check(figure.name, outcome, found, f"at most {number(most, figure.unit)}")

@@ -17,6 +17,14 @@ F4 = npt.NDArray[np.float32]
 STATE_NAMES: Final = tuple(state.name.lower().replace("_", " ") for state in DriveState)
 
 
+def since(values: npt.NDArray[Any], before: Any) -> npt.NDArray[Any]:
+    """What each value adds to the one before it, the first to ``before``: as numpy's diff, but sooner."""
+    out = np.empty_like(values)
+    out[0] = values[0] - before
+    np.subtract(values[1:], values[:-1], out=out[1:])
+    return out
+
+
 @dataclass(frozen=True, slots=True)
 class Curve:
     """One curve: its key, what the legend calls it, how it is read, and whether a comparison shows it."""

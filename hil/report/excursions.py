@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from hil.report.curves import F8
+from hil.report.curves import F8, since
 from hil.report.metrics import RECOVERED_RAD_S
 from hil.report.segments import largest
 from hil.signals import DriveState, TickArray
@@ -40,7 +40,7 @@ class Excursions:
         """Take the next ticks, at times ``t`` [s]."""
         self.truth = self.truth or bool(np.isfinite(ticks["T_L_true"]).any())
         on = (ticks["state"] == int(DriveState.OPERATION_ENABLED)) & (ticks["reason"] == 0)
-        moving = (np.diff(ticks["w_ref"], prepend=self._w_ref) != 0) | ~on
+        moving = (since(ticks["w_ref"], self._w_ref) != 0) | ~on
         moved_s = np.maximum.accumulate(np.where(moving, t, self._moved_s))
         self._w_ref, self._moved_s = float(ticks["w_ref"][-1]), float(moved_s[-1])
         resting = t - moved_s >= SETTLED_S

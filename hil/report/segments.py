@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from hil.report.curves import F8
+from hil.report.curves import F8, since
 from hil.report.metrics import RECOVERED_RAD_S
 from hil.signals import DriveState, TickArray
 
@@ -74,7 +74,7 @@ def judge(kind: Literal["load", "reference"], size: float, c: dict[str, F8], N: 
     return Response(
         kind, float(t[0]), move[3], largest(np.abs(error)), recovery,
         *move[:3],
-        float(np.nansum(np.abs(error[:-1]) * np.diff(t))),
+        _total(np.abs(error[:-1]) * (t[1:] - t[:-1])),
         deviation(error[half:]) if calm else None,
         deviation(c["i_q"][half:]) if calm else None,
         estimate,
@@ -85,6 +85,12 @@ def largest(sizes: F8) -> float:
     """Largest of numbers from 0 on, those that are none left out; 0 for none."""
     most = float(sizes.max(initial=0.0))
     return most if most == most else float(np.fmax.reduce(sizes, initial=0.0))
+
+
+def _total(values: F8) -> float:
+    """Sum of the values, those that are no number left out."""
+    total = float(values.sum())
+    return total if total == total else float(np.nansum(values))
 
 
 def deviation(values: F8) -> float:
@@ -115,10 +121,8 @@ def _move(c: dict[str, F8]) -> tuple[float | None, float | None, float | None, f
 
 def _changes(columns: F8, before: F8, name: str) -> F8:
     """What a column adds from tick to tick, to the one ``before`` in the first."""
-    row, out = _COLUMNS.index(name), np.empty(columns.shape[1])
-    out[0] = columns[row, 0] - before[row, 0]
-    np.subtract(columns[row, 1:], columns[row, :-1], out=out[1:])
-    return out
+    row = _COLUMNS.index(name)
+    return since(columns[row], before[row, 0])
 
 
 class Responses:
@@ -152,7 +156,8 @@ class Responses:
             at = row
             if kind is not None:
                 size = float(stepped[row])
-                start = [columns[:, row - 1 : row] if row else before] if kind == "reference" else []
+                start = [before] if kind == "reference" and row == 0 else []
+                at -= 1 if kind == "reference" and row > 0 else 0  # it begins at the tick before
                 self._open, self._rows = (kind, size, start), len(start)
                 found.append((row, abs(size) if kind == "load" else 0.1))
         self._extend(columns[:, at:])
@@ -164,7 +169,7 @@ class Responses:
     ) -> Iterator[tuple[int, Literal["load", "reference"] | None]]:
         """Rows at which a response begins, or where operation ends (None)."""
         moving = np.nonzero(moved)[0]
-        still = np.diff(moving + self._row, prepend=self._moved)
+        still = since(moving + self._row, self._moved) if len(moving) else moving
         self._moved = int(moving[-1]) + self._row if len(moving) else self._moved
         load = np.nonzero(np.abs(stepped) >= LOAD_STEP_N_M)[0]
         ends = np.nonzero(~on & np.concatenate([[True], on[:-1]]))[0]
@@ -186,7 +191,7 @@ class Responses:
         self._open = None
         if self._rows < 3:
             return
-        columns = np.concatenate(parts, axis=1)
+        columns = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
         response = judge(kind, size, dict(zip(_COLUMNS, columns, strict=True)), self.N)
         self.count += 1
         if len(self.kept) < MOST_KEPT:

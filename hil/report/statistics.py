@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from hil.report.curves import F8, STATE_NAMES
+from hil.report.curves import F8, STATE_NAMES, since
 from hil.signals import DriveState, GuardFlag, RxFlag, TickArray
 
 PER_DECADE: Final = 50
@@ -152,17 +152,18 @@ class Totals:
             self.peaks[name] = max(self.peaks.get(name, 0.0), _peak(ticks[name]))
 
     def _gaps(self, ticks: TickArray) -> None:
-        k = ticks["k"].astype(np.int64)
+        k = ticks["k"].astype(np.int64, copy=False)
         first = k[0] - ticks["gap"][0] if self._k is None else self._k
-        self.missing += int(np.maximum(np.diff(k, prepend=first) - ticks["gap"], 0).sum())
+        self.missing += int(np.maximum(since(k, first) - ticks["gap"], 0).sum())
         self._k = int(k[-1])
 
     def _count(self, ticks: TickArray) -> None:
+        if not self.flags:
+            self.flags = dict.fromkeys((name for names in FLAG_NAMES.values() for _, name in names), 0)
         for where, column in (("bus", "rx_flags"), ("guard", "guard_flags")):
-            words = _tally(ticks[column])
-            for flag, name in FLAG_NAMES[where]:
-                seen = sum(count for word, count in words if word & flag)
-                self.flags[name] = self.flags.get(name, 0) + seen
+            for word, count in _tally(ticks[column]):
+                for flag, name in FLAG_NAMES[where]:
+                    self.flags[name] += count if word & flag else 0
         counts = np.bincount(np.minimum(ticks["state"], len(STATE_NAMES) - 1), minlength=len(STATE_NAMES))
         for name, count in zip(STATE_NAMES, counts.tolist(), strict=True):
             self.states[name] = self.states.get(name, 0) + count
