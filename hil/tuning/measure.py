@@ -249,29 +249,14 @@ def noise(
     Of another ``motor`` than that of the bench, on an elastic shaft ``at``, from responses of ``ticks``.
     """
     law, motor, ticks = held(law, "N"), motor or bench.motor, ticks or bench.ticks
-    coupled = bench.inner is None and not adapts(law)
-    if coupled:
+    if bench.inner is None:
         out, i_noise = turning_responses(law, bench, motor, at, ticks), bench.i_noise
         sigma = np.array([bench.w_noise, i_noise, i_noise, bench.u_noise, bench.u_noise])
     else:
         out = responses(law, [bench.plant(motor, at)], _NOISE, ticks)[0][:, (0, 2)]
-        u_i = 1.0 if bench.inner is None else bench.inner.u_i
-        sigma = np.array([bench.w_noise, bench.i_noise * u_i, bench.u_noise])
+        sigma = np.array([bench.w_noise, bench.i_noise * bench.inner.u_i, bench.u_noise])
     u, w = np.sqrt((sigma[:, None] ** 2 * (out**2).sum(axis=2) / bench.every).sum(axis=0))
-    return float(u) if coupled else math.hypot(float(u), _decoupling(law, bench)), float(w)
-
-
-def _decoupling(law: Record, bench: Bench) -> float:
-    """What i_d's noise adds to u_q of an adaptive law, n_p w_0 L_d times it; 0 of a drive with its own loop.
-
-    The coupled loop makes a fifth too much of it, so it is taken by itself.
-    """
-    if bench.inner is not None or not law["coupling"][0]:
-        return 0.0
-    noise = bench.motor.n_p * bench.w_0 * bench.motor.L_d * bench.i_noise
-    if F := int(law["N"][0, 2] - law["short"][0, 2]) if law["short"][0, 2] else 0:
-        noise *= math.sqrt(2.0 * (2 * F + 1) / ((F + 1) * (F + 2)))  # the end of a line through F + 1
-    return noise
+    return float(u), float(w)
 
 
 def turning_responses(
