@@ -8,6 +8,7 @@ import struct
 import subprocess
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,11 @@ from hil.cli import main
 from hil.log.errors import LogError
 from hil.log.reader import Log, open_log
 from hil.replay import replay
+from hil.runtime.registry import matching
 from hil.runtime.setup import Overrides
 from hil.signals import Controlword, DriveState, Reason, Request
 from hil.sim.demo import emulator_process
+from hil.watch.look import Look
 from tests.process.test_run import call, flags, hil
 from tests.process.test_set import wait_for_operation
 
@@ -137,6 +140,14 @@ def test_the_second_node_s_reference_is_set_while_it_runs(
                 refused = capsys.readouterr().err
                 assert said in refused and len(refused.splitlines()) == 1, refused
             time.sleep(1.5)
+            (entry,) = matching(str(run.pid))
+            for node, said in (
+                ("motor", "set: w = 30 rad/s"),
+                ("load", "refused: this run takes no set-point"),
+            ):
+                with closing(Look(entry, node)) as look:  # as the live page's button
+                    assert look.set({"w": 30.0}, "a page") == said
+            time.sleep(0.3)
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=60)
             assert run.returncode == 0
@@ -145,7 +156,9 @@ def test_the_second_node_s_reference_is_set_while_it_runs(
     assert (motor_log.ticks["w_ref"] == 40.0).sum() > 100 and (load_log.ticks["w_ref"] == 0.0).all()
     assert np.abs(motor_log.ticks["w"] - 40.0).min() < 0.5
     set_points = [event["text"] for event in load_log.events if event["kind"] == "set-point"]
-    assert len(set_points) == 1 and set_points[0].startswith("motor: w = 40 rad/s: taken, asked by hil set")
+    assert [text.partition(", PID")[0] for text in set_points] == [
+        "motor: w = 40 rad/s: taken, asked by hil set", "motor: w = 30 rad/s: taken, asked by a page",
+    ]  # fmt: skip
     assert {name: one.verdict for name, one in replay(log_path).nodes.items()} == {
         "load": "same", "motor": "same"
     }  # fmt: skip
