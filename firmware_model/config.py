@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from firmware_model.coupling import Coupling, Masses
 from firmware_model.dialects import dialect, dialects
-from firmware_model.faults import ExtraLoad, Fault
+from firmware_model.faults import TURNING, ExtraLoad, Fault
 from firmware_model.loads.step import StepLoad
 from firmware_model.plant import MAX_LOADS, MOST_SLOTS, PARAMETERS, PARAMS, SAMPLE, STATE, State, code_of
 from firmware_model.registry import loads
@@ -322,6 +322,17 @@ class PlantConfig(Table):
     def _has_its_eds(self) -> PlantConfig:
         if bool(self.eds) != dialect(self.protocol).eds:
             raise ValueError('eds and a protocol that needs one, as "cia402", belong together')
+        return self
+
+    @model_validator(mode="after")
+    def _fails_where_it_can(self) -> PlantConfig:
+        """What turns a commanded voltage is undone at the next period of a current loop behind it."""
+        turning = [fault.kind for fault in self.fault if isinstance(fault, TURNING)]
+        if turning and self.firmware.takes != "voltage":
+            raise ValueError(
+                f"fault: {turning[0]}: acts on a commanded voltage, this drive takes a {self.firmware.takes}; "
+                "leave it out"
+            )
         return self
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ drawn from the fault's own ``seed``, so that a script gives the same run each ti
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
@@ -136,6 +136,10 @@ class PhaseSwap(FaultTable):
     """Phases b and c are exchanged between drive and motor."""
 
     kind: Literal["phase-swap"]
+
+
+TURNING: Final = (EncoderSlip, EncoderReversed, PhaseSwap)
+"""Faults that turn a commanded voltage."""
 
 
 class PhaseLoss(FaultTable):

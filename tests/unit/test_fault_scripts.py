@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections import Counter
 from contextlib import closing
 from pathlib import Path
@@ -448,3 +449,16 @@ def test_a_simulation_refuses_a_fault_script(configs: Path) -> None:
     setup = load_setup(configs / "demo.toml", Overrides())
     with pytest.raises(ConfigError, match="needs the bus"):
         make_simulation(setup, ['fault=[{kind="drop", at_s=0.1}]'])
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [{"kind": "encoder-slip", "angle_deg": 90.0}, {"kind": "encoder-reversed"}, {"kind": "phase-swap"}],
+)
+def test_what_turns_a_commanded_voltage_needs_one(fault: dict[str, Any]) -> None:
+    given = tomllib.loads((CONFIGS / "plants" / "current.toml").read_text(encoding="utf-8"))
+    PlantConfig.model_validate(given)
+    with pytest.raises(
+        ValueError, match=f"{fault['kind']}: acts on a commanded voltage, this drive takes a current"
+    ):
+        PlantConfig.model_validate(given | {"fault": [{"at_s": 0.0} | fault]})
