@@ -330,8 +330,8 @@ class PlantConfig(Table):
         turning = [fault.kind for fault in self.fault if isinstance(fault, TURNING)]
         if turning and self.firmware.takes != "voltage":
             raise ValueError(
-                f"fault: {turning[0]}: acts on a commanded voltage, this drive takes a {self.firmware.takes}; "
-                "leave it out"
+                f"fault: {turning[0]}: acts on a commanded voltage, this drive takes a "
+                f"{self.firmware.takes}; leave it out"
             )
         return self
 
