@@ -393,7 +393,7 @@ def asked_for_a_speed(drive: Drive, n: int) -> None:
     cells = drive.inbox.cells
     w = int(np.float64(1.5).view(np.int64))
     cells[inbox.HAS], cells[inbox.W], cells[inbox.I_Q] = 1, w, 0
-    cells[inbox.CHECK] = inbox._check(1, 1, w, 0)
+    cells[inbox.CHECK] = inbox._check(1, 1, w, 0, 0)
     cells[inbox.ASKED] = 1
     calm(drive, n)
 
