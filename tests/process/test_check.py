@@ -106,7 +106,7 @@ def test_a_slow_pll_is_refused_unless_it_is_told(configs: Path, settings: Settin
     assert rows["speed filter"]["verdict"] == "fail" and "tells no filter" in rows["speed filter"]["found"]
     _, rows, _ = checked(path, (*own, f"drive.speed_filter={{{pll}}}"))
     found = rows["speed filter"]["found"]
-    assert "which the observer knows: Ms 1.60, gain margin" in found and "delay" in found
+    assert "which the observer knows: Ms 1.79, gain margin" in found and "delay" in found
 
 
 def test_the_table_keeps_its_brackets(configs: Path, settings: Settings) -> None:
