@@ -151,16 +151,17 @@ def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array) -> tuple[
 
 
 @jit
-def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, out: Array) -> None:
+def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool, out: Array) -> None:
     """u_q and dw after pulses on w, i_q, i_d, u_q, u_d, one after the other; ``out`` (5, 2, K) per unit.
 
     The motor runs at w (:func:`turning`), so law and motor couple the axes. The pulses are so small that this
-    is as good as linear; what the loop does without them (it starts, a shaft rings) is taken off.
+    is as good as linear; what the loop does without them is taken off: where it ``settles``, as with the
+    motor that the law believes in, the rest that it has come to, else (a shaft rings) tick by tick.
     """
     n, K = A.shape[0], out.shape[2]
     x, new = np.empty(n), np.empty(n)
     rest = SETTLED * max(p["N"][0], p["N"][1], 50)
-    for size in range(2):
+    for size in range(1 if settles else 0, 2):
         reset(s)
         x[:] = 0.0
         u_q, u_d = -B[1, 2] / B[1, 0], 0.0  # against the back-EMF
@@ -172,6 +173,8 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, out: Array) ->
             observe(p, s, w + x[0] + on_w, x[1] + on_q, x[n - 1] + on_d, True, 1)
             apply(s, 0.0, u_q, u_d)
             command(p, s, w, 0.0, 0.0, NO_LIMIT)
+            if k == -1 and settles:
+                out[:, 0], out[:, 1] = s["u"][1], x[0]
             if k >= 0 and size == 0:
                 out[kind, 0, at], out[kind, 1, at] = s["u"][1], x[0]
             elif k >= 0:

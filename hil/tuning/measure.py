@@ -267,9 +267,8 @@ def turning_responses(
     own["cogs"], own["i_max"] = 0, np.inf
     out = _buffer((5, 2, ticks))
     with np.errstate(over="ignore", invalid="ignore"):
-        respond_turning(
-            own[0], _state()[0], *turning(motor, bench.T_s, bench.w_0, mechanics[0]), bench.w_0, out
-        )
+        plant = turning(motor, bench.T_s, bench.w_0, mechanics[0])
+        respond_turning(own[0], _state()[0], *plant, bench.w_0, at is None and motor is bench.motor, out)
     return out
 
 
