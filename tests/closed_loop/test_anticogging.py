@@ -26,7 +26,7 @@ COGGING = {36: 0.35, 72: 0.1, 1: 0.15}
 """configs/plants/cogging.toml [N m]."""
 K_T = 0.76 / 0.8
 """The motor's torque constant over the one that is believed in: by that its torques are too large."""
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.slow]
 
 
 @cache

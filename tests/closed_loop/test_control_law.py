@@ -25,6 +25,8 @@ from hil.control.law import (
     sampled_model,
 )
 
+pytestmark = pytest.mark.slow
+
 T_S = 1e-3
 N_W = 12
 U_LIMIT = 300.0

@@ -13,7 +13,7 @@ from hil.identify.session import Session, planned, setup_for
 from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.slow]
 BLOCKED = 'load=[{kind="brake",torque_n_m=100.0}]'
 DRIVEN = 'load=[{kind="constant",torque_n_m=1.5}]'
 HANGS = 'load=[{kind="constant",torque_n_m=0.15}]'

@@ -15,7 +15,7 @@ from hil.signals import Reason, TickArray
 from hil.sim.simulate import simulate_ticks
 from tests.conftest import CONFIGS
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.slow]
 TRUE = 1.5 * 3 * 0.76 / 0.01265
 """k_t / J of configs/motors/bench.toml; the configurations believe 327."""
 IN_TORQUE = 3.6 / (1.5 * 3 * 0.76)

@@ -17,7 +17,7 @@ from hil.identify.session import Session, planned, setup_for
 from hil.signals import Reason
 from hil.sim.simulate import simulate_ticks
 
-pytestmark = pytest.mark.compiled
+pytestmark = [pytest.mark.compiled, pytest.mark.slow]
 GOALS = {"R_s": 0.02, "L_d": 0.02, "L_q": 0.02, "psi_f": 0.02, "J": 0.03, "coulomb": 0.1}
 
 

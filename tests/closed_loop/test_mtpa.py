@@ -27,7 +27,7 @@ MATCHED = (
     "motor={R_s_ohm=2.875, L_d_h=0.033, L_q_h=0.066, psi_f_wb=0.8, n_p=3, J_kg_m2=0.011, B_f_n_m_s=2e-4}",
 )
 U = 0.92 * 180.0
-pytestmark = pytest.mark.compiled  # whole runs: interpreted they take minutes
+pytestmark = [pytest.mark.compiled, pytest.mark.slow]  # whole runs: interpreted they take minutes
 
 
 @cache

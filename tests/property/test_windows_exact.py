@@ -26,6 +26,8 @@ from hil.control.observers.least_noise import closed_form
 from hil.control.registry import Channel, observers
 from tests.conftest import ROOT
 
+pytestmark = pytest.mark.slow
+
 T_S = 1e-3
 MOTOR = MotorModel(2.875, 0.033, 0.033, 0.8, 3, 0.011, 2e-4)
 MODEL = sampled_model(MOTOR, T_S)

@@ -22,6 +22,8 @@ from hil.runtime.setup import Overrides, load_setup
 from hil.signals import TICK, new_ticks
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 DBCS = sorted((CONFIGS / "drives").glob("*.dbc"))
 
 

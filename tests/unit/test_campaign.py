@@ -32,6 +32,8 @@ from hil.tuning.loop import rigid
 from hil.tuning.measure import margins
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 SHORT = 'set = ["loop.duration_s=0.6", "reference.at_s=0.05"]\nplant_set = ["load.0.at_s=0.3"]\n'
 J = '"plant:motor.J_kg_m2"'
 

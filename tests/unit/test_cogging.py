@@ -21,6 +21,8 @@ from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, RxFlag, new_ticks
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 PATH = CONFIGS / "cogging.toml"
 FILE = {
     "motor": "reconstruction", "n_p": 3, "k_t_n_m_a": 3.6, "orders": [1, 36],

@@ -24,6 +24,8 @@ from hil.manual.schema import FILES, schema_of
 from hil.manual.units import PURE
 from tests.conftest import CONFIGS, ROOT
 
+pytestmark = pytest.mark.slow
+
 MADE = files()
 KEYS = [key for table in tables() for key in table.keys]
 VALIDATORS = {file: jsonschema.Draft202012Validator(schema_of(file)) for file in FILES}

@@ -23,6 +23,8 @@ from hil.tuning.verify import plants_of, verdict, verify
 from hil.tuning.windows import own_loop_figures
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 NAMES = ("current", "moteus", "odrive", "cia402")
 QUICK = ("loop.duration_s=3.0",)
 SELDOM = "feedback.period_ms=10.0"
