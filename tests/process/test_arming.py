@@ -239,3 +239,22 @@ def assert_silent(path: Path, least: int) -> None:
     assert all(frame.received for frame in log.frames)
     assert any(event["kind"] == "shadow" for event in log.events)
     assert (log.ticks["state"] == DriveState.OPERATION_ENABLED).sum() > least
+
+
+def test_a_shadow_without_another_controller_waits_and_sends_nothing(
+    configs: Path, settings: Settings, tmp_path: Path, channel: str
+) -> None:
+    own, path = settings("loop.duration_s=1.0"), configs / "demo.toml"
+    monitor = Monitor(channel)
+    with (
+        emulator_process(path, Overrides(settings=own)),
+        hil("run", str(path), "--shadow", *flags(own)) as shadow,
+    ):
+        seen: Counter[tuple[int, int]] = Counter()
+        while shadow.poll() is None:
+            seen += monitor.count(0.2)
+        assert shadow.returncode == 0, shadow.communicate()
+    seen += monitor.count(0.2)
+    monitor.close()
+    assert {can_id for _, can_id in seen} == {0x701}
+    assert len(senders(seen)) == 1
