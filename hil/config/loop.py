@@ -66,7 +66,7 @@ class RealtimeTable(Table):
     cpu: Annotated[int, Field(ge=0, le=4095)] | None = None
     """Number of the processor that the loop stays on; left out: any."""
     lock_memory: bool = True
-    """Keep all memory of the loop's process in RAM (mlockall)."""
+    """Keep all memory of the loop's process in RAM (mlockall) and in its place (no huge pages made of it)."""
 
 
 class GuardianTable(Table):

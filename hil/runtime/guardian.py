@@ -199,6 +199,7 @@ class Rights:
         gc.freeze()
         if self.lock_memory:
             realtime.lock_as_touched()
+            realtime.keep_pages()
         if self.priority > 0:
             with contextlib.suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(self.priority + 1, 99)))

@@ -65,3 +65,17 @@ def test_memory_is_locked_before_fifo_is_asked_for(
         monkeypatch.setattr(gc, name, lambda: None)
     ask()
     assert asked == ["memory", "fifo"]
+
+
+@pytest.mark.parametrize(("ask", "left"), [("acquire", "0"), ("probe", "1")])
+def test_khugepaged_is_kept_off_the_loops_pages(ask: str, left: str) -> None:
+    """While it copies pages together nothing preempts it: two periods of a run without FIFO were skipped."""
+    code = f"""
+from hil.config.loop import RealtimeTable
+from hil.runtime import realtime
+grants = realtime.{ask}(RealtimeTable(fifo_priority=0))
+assert [grant.granted for grant in grants if grant.what == "pages left in place"] == [True], grants
+print(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("THP_enabled")))
+"""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.strip() == left

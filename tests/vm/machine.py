@@ -42,6 +42,7 @@ TOOLS = {
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "kvaser_pci", "can_raw", "can_bcm", "vcan", "sch_tbf")
 SIGN = "hil.bench_machine=1"
 FAST = "mitigations=off init_on_alloc=0 hardened_usercopy=off"
+STEADY = "preempt=full transparent_hugepage=madvise"
 TIMEOUT_S = 300.0
 PACKAGES = ("hil", "drivers", "firmware_model")
 WAKE = b"\n" * 8  # a character that comes before the state is there is lost
@@ -146,7 +147,7 @@ def _qemu(kernel: Path, out: Path) -> list[str]:
     return [
         QEMU, "-nodefaults", "-no-user-config", "-display", "none", "-no-reboot",
         "-m", "2048", "-smp", "1", "-cpu", "max,-erms,-fsrm", "-accel", "tcg", "-icount", "shift=0,sleep=off",
-        "-kernel", str(kernel), "-append", f"console=ttyS0 quiet panic=-1 {FAST} preempt=full {SIGN}",
+        "-kernel", str(kernel), "-append", f"console=ttyS0 quiet panic=-1 {FAST} {STEADY} {SIGN}",
         "-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap",
         "-virtfs", f"local,path={out},mount_tag=out,security_model=none",
         "-object", "can-bus,id=c0", "-device", "kvaser_pci,canbus=c0", "-device", "kvaser_pci,canbus=c0",
