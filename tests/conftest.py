@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # small matrices; before numpy
     os.environ.setdefault(name, "1")
@@ -22,6 +24,28 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a 
 
 if worker := os.environ.get("PYTEST_XDIST_WORKER"):  # no list of runs is another worker's
     os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix=f"hil-{worker}-")
+
+
+MACHINE = "tests/vm/"
+"""Its tests share one boot of the bench machine: one worker's, and the longest job of all."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest job first, so that the other workers have something to do meanwhile."""
+    items.sort(key=lambda item: not item.nodeid.startswith(MACHINE))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling | None:
+    """A file is on one worker (``--dist=loadfile``), and the bench machine's files are on one."""
+    if config.getoption("dist") != "loadfile":
+        return None
+
+    class Files(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return MACHINE if nodeid.startswith(MACHINE) else nodeid.split("::", 1)[0]
+
+    return Files(config, log)
 
 
 def pytest_unconfigure() -> None:

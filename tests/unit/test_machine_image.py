@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.vm import image
+from tests.vm import image, machine
 
 NAME = "0123456789abcdef"
 
@@ -176,3 +177,28 @@ def test_a_job_in_the_imported_python_is_as_in_a_new_one(
 def test_a_job_that_is_not_there_fails(words: list[str], standby: list[str], tmp_path: Path) -> None:
     code, _, said = run_job(tmp_path, standby, words)
     assert code == 1 and "missing" in said.splitlines()[-1]
+
+
+def test_kernels_that_others_replace_meanwhile_are_taken_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Indices first: what an index names was there before it; a file that goes as it is found is left out."""
+    folder, taken, order = tmp_path / "kernels", tmp_path / "taken", []
+    (folder / "room").mkdir(parents=True)
+    for name in ("a.1.nbc", "a.nbi", "b.1.nbc", "b.nbi"):
+        (folder / "room" / name).write_text(name)
+    (folder / "warm-1").touch()
+    (folder / "room" / "gone.1.nbc").symlink_to(tmp_path / "nowhere")
+    copy = shutil.copy2
+
+    def watched(source: Path, target: Path) -> object:
+        order.append(Path(source).suffix)
+        return copy(source, target)
+
+    monkeypatch.setattr(machine, "kernels", lambda: folder)
+    monkeypatch.setattr(shutil, "copy2", watched)
+    machine.take_kernels(taken)
+    assert order == [".nbi", ".nbi", ".nbc", ".nbc", ".nbc"]
+    assert {path.name: path.read_text() for path in (taken / "room").iterdir()} == {
+        name: name for name in ("a.1.nbc", "a.nbi", "b.1.nbc", "b.nbi")
+    }

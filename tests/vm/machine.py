@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import compileall
+import contextlib
 import hashlib
 import json
 import os
@@ -154,7 +155,7 @@ def _qemu(kernel: Path, out: Path) -> list[str]:
     ]  # fmt: skip
 
 
-def _job(command: Sequence[str]) -> str:
+def _job(command: Sequence[str], kernels: Path) -> str:
     """What Python in the machine does once it is woken: interfaces up, kernels on its tmpfs, the command."""
     folders = [
         str(Path(sys.executable).parent),
@@ -172,7 +173,7 @@ def _job(command: Sequence[str]) -> str:
         "OPENBLAS_NUM_THREADS": "1",
     }
     setup = f"""\
-mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels()))}/. /dev/shm/numba
+mkdir /dev/shm/numba && cp -rs {shlex.quote(str(kernels))}/. /dev/shm/numba
 echo -1 > /proc/sys/kernel/sched_rt_runtime_us
 ip link set lo up
 ip link add vcan0 type vcan && ip link set vcan0 mtu 72 && ip link set vcan0 up
@@ -192,6 +193,16 @@ def kernels() -> Path:
     from drivers.kernelcache import cache_folder as folder_of
 
     return folder_of()
+
+
+def take_kernels(into: Path) -> None:
+    """Copy the kernels, an index before the files that it names: others may replace any meanwhile."""
+    folder = kernels()
+    for path in sorted(folder.rglob("*.nb?"), key=lambda path: path.suffix != ".nbi"):
+        target = into / path.relative_to(folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(FileNotFoundError):  # replaced as it was found: it belongs to a later index
+            shutil.copy2(path, target)
 
 
 def compile_sources() -> None:
@@ -245,11 +256,12 @@ def run_in_machine(
     folder.mkdir(parents=True, exist_ok=True)
     for name in ("stdout", "stderr", "code"):
         (folder / name).unlink(missing_ok=True)
-    (folder / "job.json").write_text(_job(command))
     serial = folder / "serial.log"
     wake = [*_qemu(kernel, folder), "-serial", "stdio", "-incoming", restored(image)]
     try:
-        with serial.open("wb") as log:
+        with serial.open("wb") as log, tempfile.TemporaryDirectory(prefix="hil-kernels-") as taken:
+            take_kernels(Path(taken))
+            (folder / "job.json").write_text(_job(command, Path(taken)))
             subprocess.run(
                 wake, input=WAKE, stdout=log, stderr=subprocess.PIPE, timeout=timeout_s, check=True
             )
