@@ -146,6 +146,7 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         _speed(setup),
         brake=brake,
         i_d_noise=i_d_noise,
+        i_d_lsb=lsb_of(setup)[2],
         **more,
     )
 

@@ -171,9 +171,9 @@ def _unstable(best: Tuned, bench: Bench, base: LawSpec, wish: Wish) -> list[tupl
     """The shafts on which it is unstable in a corner, on a finer grid and for longer than the search."""
     law = law_of(best.tables, base, bench.T_s)
     fine = [
-        (one, replace(bench, shafts=(one,)).shaft_plants()) for one in wish.shafts(CHECKED_HZ) or bench.shafts
+        (one, replace(bench, shafts=(one,)).shaft_places()) for one in wish.shafts(CHECKED_HZ) or bench.shafts
     ]
-    return [one for one, plants in fine if not all(quiet(law, bench, plants, CHECK_S))]
+    return [one for one, places in fine if not all(quiet(law, bench, places, CHECK_S))]
 
 
 def _front(found: Sequence[Tuned]) -> list[Tuned]:

@@ -28,6 +28,11 @@ SETTLED: Final = 6
 SMALL: Final = (0.1, 0.01, 0.01, 0.1, 0.1)
 """Pulses of :func:`respond_turning` [rad/s, A, A, V, V]."""
 
+KICK: Final = 0.01
+"""Start of :func:`vibrate` [rad/s]."""
+GROWN: Final = 100.0
+"""Kicks at which its loop counts as unstable."""
+
 
 @dataclass(frozen=True, slots=True)
 class Plant:
@@ -152,7 +157,7 @@ def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array) -> tuple[
 
 @jit
 def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool, out: Array) -> None:
-    """u_q and dw after pulses on w, i_q, i_d, u_q, u_d, one after the other; ``out`` (5, 2, K) per unit.
+    """u_q, dw and i_d after pulses on w, i_q, i_d, u_q, u_d, one after the other; ``out`` (5, 3, K) per unit.
 
     The motor runs at w (:func:`turning`), so law and motor couple the axes. The pulses are so small that this
     is as good as linear; what the loop does without them is taken off: where it ``settles``, as with the
@@ -174,12 +179,13 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool,
             apply(s, 0.0, u_q, u_d)
             command(p, s, w, 0.0, 0.0, NO_LIMIT)
             if k == -1 and settles:
-                out[:, 0], out[:, 1] = s["u"][1], x[0]
+                out[:, 0], out[:, 1], out[:, 2] = s["u"][1], x[0], x[n - 1]
             if k >= 0 and size == 0:
-                out[kind, 0, at], out[kind, 1, at] = s["u"][1], x[0]
+                out[kind, 0, at], out[kind, 1, at], out[kind, 2, at] = s["u"][1], x[0], x[n - 1]
             elif k >= 0:
                 out[kind, 0, at] = (s["u"][1] - out[kind, 0, at]) / SMALL[kind]
                 out[kind, 1, at] = (x[0] - out[kind, 1, at]) / SMALL[kind]
+                out[kind, 2, at] = (x[n - 1] - out[kind, 2, at]) / SMALL[kind]
             q, d = u_q + pulse * (kind == 3), u_d + pulse * (kind == 4)
             for r in range(n):
                 total = B[r, 0] * q + B[r, 1] * d + B[r, 2]
@@ -188,6 +194,43 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool,
                 new[r] = total
             x[:] = new
             u_q, u_d = s["u"][1], s["u"][2]
+
+
+@jit
+def vibrate(p: Any, s: Any, A: Array, B: Array, w: float, emf: float, out: Array) -> None:
+    """dw from a start KICK off the speed w on, with the axes coupled (:func:`turning`); inf once it grew.
+
+    What back-EMF the law does not know, a constant voltage, is left out: it would be the larger kick by far,
+    and the loop is as good as linear for small ones alone. ``emf`` [V] is that which it knows.
+    """
+    n = A.shape[0]
+    x, new = np.zeros(n), np.empty(n)
+    reset(s)
+    x[0] = KICK
+    u_q, u_d = emf, 0.0
+    apply(s, 0.0, u_q, u_d)
+    for k in range(len(out)):
+        out[k] = x[0]
+        if not abs(x[0]) < GROWN * KICK:
+            out[k:] = np.inf
+            return
+        observe(p, s, w + x[0], x[1], x[n - 1], True, 1)
+        apply(s, 0.0, u_q, u_d)
+        command(p, s, w, 0.0, 0.0, NO_LIMIT)
+        for r in range(n):
+            total = B[r, 0] * (u_q - emf) + B[r, 1] * u_d
+            for c in range(n):
+                total += A[r, c] * x[c]
+            new[r] = total
+        x[:] = new
+        u_q, u_d = s["u"][1], s["u"][2]
+
+
+@jit
+def vibrate_all(p: Any, s: Any, A: Array, B: Array, w: float, emf: float, out: Array) -> None:
+    """:func:`vibrate` of every plant; A (m, n, n), B (m, n, 3), out (m, K)."""
+    for m in range(len(A)):
+        vibrate(p, s, A[m], B[m], w, emf, out[m])
 
 
 @jit

@@ -38,7 +38,9 @@ from hil.tuning.loop import (
     shaft,
     turning,
     two_masses,
+    vibrate_all,
 )
+from hil.tuning.rounding import through_rounding
 from hil.tuning.sensitivity import margins_of, peak_of
 
 RESPONSE_S: Final = 0.4
@@ -49,6 +51,12 @@ SPARE: Final = 0.5
 """Share of an elastic shaft's damping with which a design has to be stable: what it may take is the rest."""
 RINGING_S: Final = 4.0
 """Length of the responses on an elastic shaft, whose vibration outlasts the others."""
+UNQUIET: Final = (math.inf, math.inf)
+"""Of a loop that does not come to rest."""
+Elastic = tuple[float, float, float]
+"""An elastic shaft: resonance [Hz], damping ratio, the motor's share of J."""
+Place = tuple[MotorModel, Elastic | None]
+"""A motor, on an elastic shaft or rigid."""
 _MODES: Final[tuple[Literal["short", "N"], ...]] = ("short", "N")
 _STEP, _OWN_STEP = np.array([LOAD, PULSE_U]), np.array([LOAD, PULSE_W])
 _NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U])
@@ -62,8 +70,9 @@ class Bench:
     axes are coupled; ``spread`` is the share by which J, psi_f, R_s
     and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with;
     ``brake``: the load step acts on the motor, not behind the shaft;
-    ``i_d_noise`` is that of i_d where its frame is coarser than i_q's. Of a drive with a current loop of its
-    own (``inner``) u is in its ``unit``, A or N m, and ``filter`` is what its speed really comes through.
+    ``i_d_noise`` is that of i_d with the resolution ``i_d_lsb`` [A] of its frame, which may be coarser than
+    i_q's. Of a drive with a current loop of its own (``inner``) u is in its ``unit``, A or N m, and
+    ``filter`` is what its speed really comes through.
     """
 
     motor: MotorModel
@@ -74,9 +83,10 @@ class Bench:
     u_noise: float = 0.0
     w_0: float = 0.0
     spread: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3))
-    shafts: tuple[tuple[float, float, float], ...] = ()
+    shafts: tuple[Elastic, ...] = ()
     brake: bool = False
     i_d_noise: float = 0.0
+    i_d_lsb: float = 0.0
     inner: InnerLoop | None = None
     filter: SpeedFilter | None = None
     unit: str = "V"
@@ -105,7 +115,7 @@ class Bench:
         """The believed motor, then every corner."""
         return [self.plant(motor) for motor in (self.motor, *self.corners())]
 
-    def plant(self, motor: MotorModel, at: tuple[float, float, float] | None = None) -> Plant:
+    def plant(self, motor: MotorModel, at: Elastic | None = None) -> Plant:
         """A motor, on an elastic shaft (Hz, damping, share) where one is given, behind what drives it."""
         if self.inner is None:
             return shaft(motor, self.T_s, *at, self.brake) if at else rigid(motor, self.T_s)
@@ -113,12 +123,12 @@ class Bench:
         masses = two_masses(motor, *at, self.brake) if at else None
         return shaft_of(motor, inner, self.filter, self.T_s, masses)
 
-    def shaft_plants(self) -> list[Plant]:
+    def shaft_places(self) -> list[Place]:
         """The believed motor and every corner on each elastic shaft, of whose damping SPARE is left."""
         motors, shafts = (self.motor, *self.corners()), self.shafts
-        return [self.plant(motor, (hz, SPARE * d, share)) for motor in motors for hz, d, share in shafts]
+        return [(motor, (hz, SPARE * d, share)) for motor in motors for hz, d, share in shafts]
 
-    def turns(self) -> list[tuple[float, float, float] | None]:
+    def turns(self) -> list[Elastic | None]:
         """The elastic shaft of each of :meth:`plants`, of several in turn; None where there is none.
 
         Neighbours among the corners get resonances far apart, so that none goes with a low J alone.
@@ -142,7 +152,6 @@ class Loop:
         return math.isfinite(self.ms)
 
 
-UNQUIET: Final = (math.inf, math.inf)
 UNSTABLE: Final = Loop(math.inf, math.inf, math.inf, math.inf)
 
 
@@ -157,14 +166,19 @@ def _state() -> Record:
     return new_law_state()
 
 
+def _free(law: Record) -> Record:
+    """The law without the limit of the current; and what is known over the angle is no part of its loop."""
+    own = law.copy()
+    own["cogs"], own["i_max"] = 0, np.inf
+    return own
+
+
 def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int, closed: bool = True) -> Array:
     """Responses (plants, kinds, 4, ticks), valid until the next call; without the limit of the current.
 
     Not ``closed``: those of the observer alone, of a drive with a current loop of its own.
     """
-    own = law.copy()
-    own["cogs"] = 0  # known over the angle: no part of the linear loop
-    own["i_max"] = np.inf
+    own = _free(law)
     out = _buffer((len(plants), len(kinds), 4, ticks))
     A, b, e, C = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "b", "e", "C"))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -242,7 +256,7 @@ def _loop(w: Array, u: Array, T_s: float) -> Loop:
 
 def noise(
     law: Record, bench: Bench, motor: MotorModel | None = None,
-    at: tuple[float, float, float] | None = None, ticks: int | None = None,
+    at: Elastic | None = None, ticks: int | None = None,
 ) -> tuple[float, float]:  # fmt: skip
     """Noise of the command [bench.unit] and of the true speed [rad/s], rms, for the bench's, at its speed.
 
@@ -250,24 +264,30 @@ def noise(
     """
     law, motor, ticks = held(law, "N"), motor or bench.motor, ticks or bench.ticks
     if bench.inner is None:
-        out, i_noise = turning_responses(law, bench, motor, at, ticks), bench.i_noise
-        sigma = np.array([bench.w_noise, i_noise, i_noise, bench.u_noise, bench.u_noise])
-    else:
-        out = responses(law, [bench.plant(motor, at)], _NOISE, ticks)[0][:, (0, 2)]
-        sigma = np.array([bench.w_noise, bench.i_noise * bench.inner.u_i, bench.u_noise])
+        return _coupled_noise(turning_responses(law, bench, motor, at, ticks), bench)
+    out = responses(law, [bench.plant(motor, at)], _NOISE, ticks)[0][:, (0, 2)]
+    sigma = np.array([bench.w_noise, bench.i_noise * bench.inner.u_i, bench.u_noise])
     u, w = np.sqrt((sigma[:, None] ** 2 * (out**2).sum(axis=2) / bench.every).sum(axis=0))
     return float(u), float(w)
 
 
-def turning_responses(
-    law: Record, bench: Bench, motor: MotorModel, at: tuple[float, float, float] | None, ticks: int
-) -> Array:
-    """Command and speed (5, 2, ticks) of :func:`hil.tuning.loop.respond_turning`, at the bench's speed."""
-    own, mechanics = law.copy(), two_masses(motor, *at) if at else one_mass(motor)
-    own["cogs"], own["i_max"] = 0, np.inf
-    out = _buffer((5, 2, ticks))
+def _coupled_noise(out: Array, bench: Bench) -> tuple[float, float]:
+    """Of :func:`noise`, from :func:`turning_responses`; the frame's i_d is rounded in the loop.
+
+    Infinite where the loop is unstable.
+    """
+    if not np.isfinite(out).all():
+        return UNQUIET
+    sigma = np.array([bench.w_noise, bench.i_noise, bench.i_noise, bench.u_noise, bench.u_noise])
+    u, w, _ = through_rounding(out, sigma, 2, 2, bench.i_d_lsb)
+    return float(u), float(w)
+
+
+def turning_responses(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, ticks: int) -> Array:
+    """u_q, speed, i_d (5, 3, ticks) of :func:`hil.tuning.loop.respond_turning`, at the bench's speed."""
+    own, plant = _free(law), _turning(motor, bench.T_s, bench.w_0, at)
+    out = _buffer((5, 3, ticks))
     with np.errstate(over="ignore", invalid="ignore"):
-        plant = turning(motor, bench.T_s, bench.w_0, mechanics[0])
         respond_turning(own[0], _state()[0], *plant, bench.w_0, at is None and motor is bench.motor, out)
     return out
 
@@ -284,13 +304,11 @@ def foretold(law: Record, bench: Bench) -> list[tuple[float, float]]:
         noises = [noise(law, bench, motor)[0] for motor in motors]
         return list(zip(dips, noises, strict=True))
     each = list(zip(motors, bench.turns(), strict=True))
-    calm = quiet(law, bench, [bench.plant(*one) for one in each], RINGING_S)
+    calm = quiet(law, bench, each, RINGING_S, (bench.w_0,))
     return [_ringing(law, bench, *one) if rests else UNQUIET for one, rests in zip(each, calm, strict=True)]
 
 
-def _ringing(
-    law: Record, bench: Bench, motor: MotorModel, at: tuple[float, float, float] | None
-) -> tuple[float, float]:
+def _ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> tuple[float, float]:
     """Of :func:`foretold`, where the vibration outlasts the response that a dip is read from."""
     stepped, plant = to_unit_load(law, bench.load) if adapts(law) else law, bench.plant(motor, at)
     w = responses(stepped, [plant], _STEP[:1], bench.ticks)[0, 0, 1 if own_loop(law) else 2]
@@ -304,19 +322,52 @@ def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
     return asdict(margins_of(pulse, bench.every * bench.T_s))
 
 
-def quiet(law: Record, bench: Bench, plants: Sequence[Plant], seconds: float = 1.2) -> list[bool]:
-    """Whether a load step's vibration dies away with each plant: its rms falls from second to last third."""
-    if not plants:
+def quiet(
+    law: Record, bench: Bench, places: Sequence[Place], seconds: float = 1.2,
+    speeds: tuple[float, ...] | None = None,
+) -> list[bool]:  # fmt: skip
+    """Whether vibration dies away in each place: its rms falls from second to last third.
+
+    With the axes coupled, at all ``speeds`` [rad/s], without which at rest and at the bench's. Behind a
+    current loop of its own it is the vibration after a load step.
+    """
+    if not places:
         return []
     if adapts(law):
-        both = (quiet(held(law, name), bench, plants, seconds) for name in _MODES)
+        both = (quiet(held(law, name), bench, places, seconds, speeds) for name in _MODES)
         return [short and long for short, long in zip(*both, strict=True)]
     ticks = round(seconds / bench.T_s)
-    w = responses(law, plants, _STEP[:1], ticks)[:, 0, 2] * bench.load
-    thirds = [w[:, ticks // 3 * part : ticks // 3 * (part + 1)] for part in (1, 2)]
+    if bench.inner is not None:
+        plants = [bench.plant(*place) for place in places]
+        return _dying(responses(law, plants, _STEP[:1], ticks)[:, 0, 2] * bench.load)
+    each = [_dying(_vibrations(law, bench, places, ticks, w)) for w in speeds or {0.0, bench.w_0}]
+    return [all(calm) for calm in zip(*each, strict=True)]
+
+
+@functools.lru_cache(4096)
+def _turning(motor: MotorModel, T_s: float, w: float, at: Elastic | None) -> tuple[Array, Array]:
+    """:func:`hil.tuning.loop.turning` in one place."""
+    return turning(motor, T_s, w, (two_masses(motor, *at) if at else one_mass(motor))[0])
+
+
+def _vibrations(law: Record, bench: Bench, places: Sequence[Place], ticks: int, w: float) -> Array:
+    """:func:`hil.tuning.loop.vibrate` at w in places of one kind, rigid or not; (places, ticks)."""
+    own, out, emf = _free(law), _buffer((len(places), ticks)), bench.motor.n_p * w * bench.motor.psi_f
+    A, B = (
+        np.array(part)
+        for part in zip(*(_turning(motor, bench.T_s, w, at) for motor, at in places), strict=True)
+    )
     with np.errstate(over="ignore", invalid="ignore"):
-        first, last = (np.std(third, axis=1) for third in thirds)
-    return [bool(b < a or b < 1e-6) for a, b in zip(first, last, strict=True)]
+        vibrate_all(own[0], _state()[0], A, B, w, emf, out)
+    return out
+
+
+def _dying(signals: Array) -> list[bool]:
+    """Whether the rms of each signal (m, ticks) falls from its second to its last third."""
+    part = signals.shape[1] // 3
+    with np.errstate(over="ignore", invalid="ignore"):
+        first, last = (np.std(signals[:, part * j : part * (j + 1)], axis=1) for j in (1, 2))
+    return [bool(b < a or b < 1e-8) for a, b in zip(first, last, strict=True)]
 
 
 def noise_in(unit: str, value: float) -> dict[str, float]:

@@ -21,7 +21,7 @@ from hil.control.linalg import Array
 from hil.control.registry import complete, laws, observers
 from hil.tuning.families import Family, Tables
 from hil.tuning.loop import Plant, Record
-from hil.tuning.measure import Bench, Verdict, judge, loops, noise, quiet, worst_of
+from hil.tuning.measure import Bench, Place, Verdict, judge, loops, noise, quiet, worst_of
 
 SLACK: Final = 0.002
 """Share by which a limit may be exceeded: below what its measure is exact to."""
@@ -78,11 +78,11 @@ class _Search:
     seen: dict[tuple[float, ...], float] = field(default_factory=dict)
     nominal: Plant = field(init=False)
     every: list[Plant] = field(init=False)
-    shafts: list[Plant] = field(init=False)
+    shafts: list[Place] = field(init=False)
 
     def __post_init__(self) -> None:
         self.nominal, *self.every = self.bench.plants()
-        self.shafts = self.bench.shaft_plants()
+        self.shafts = self.bench.shaft_places()
 
     def numbers(self, y: Array) -> Array:
         """Free numbers from their logarithms, ticks whole."""

@@ -147,7 +147,7 @@ def test_a_stiff_shaft_is_a_rigid_one_and_a_soft_one_is_not() -> None:
     assert other.dip == pytest.approx(one.dip, rel=0.01) and other.ms == pytest.approx(one.ms, rel=0.02)
     fast = law_of(tables(350.0, 8.0), spec_in(setup), bench.T_s)
     slow = law_of(tables(10.0, 60.0), spec_in(setup), bench.T_s)
-    soft = [bench.plant(bench.motor, (60.0, 0.01, 0.5))]
+    soft = [(bench.motor, (60.0, 0.01, 0.5))]
     assert not quiet(fast, bench, soft, 3.0)[0] and quiet(slow, bench, soft, 3.0)[0]
 
 
