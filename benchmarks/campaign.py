@@ -23,10 +23,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -39,7 +38,6 @@ from benchmarks.__main__ import HERE, peer
 from hil.bench.machine import machine_facts
 from hil.campaign.case import job_of
 from hil.campaign.plan import read_plan
-from hil.campaign.run import campaign
 from hil.config.shipped import find_config
 from hil.report.segments import Responses
 from hil.report.statistics import Totals
@@ -49,7 +47,7 @@ from hil.sim.simulate import simulate_ticks
 
 REPEATS, TURNS, CASE_S = 40, 3, 6.0
 LOOK_S = 0.5
-"""From one look at all processes to the next: more often, it takes a share of the client's time."""
+"""From one look at all processes to the next; each takes milliseconds."""
 PLANT = """[random]
 "plant:motor.J_kg_m2" = { percent = 20 }
 "plant:motor.R_s_ohm" = { percent = 20 }
@@ -111,40 +109,35 @@ def one_case(folder: Path) -> dict[str, float]:
     }
 
 
-@contextlib.contextmanager
-def watched(found: dict[str, float]) -> Iterator[None]:
-    """Peak memory of the largest process below this one [MB], and processor seconds of all of them."""
-    stop, seconds = threading.Event(), dict[int, float]()
-
-    def look() -> None:
-        while not stop.wait(LOOK_S):
-            for process in psutil.Process().children(recursive=True):
-                with contextlib.suppress(psutil.Error):
-                    found["peak_mb"] = max(found.get("peak_mb", 0.0), process.memory_info().rss / 1e6)
-                    used = process.cpu_times()
-                    seconds[process.pid] = used.user + used.system
-
-    own, thread = os.times(), threading.Thread(target=look)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
-        now = os.times()
-        found["client_s"] = now.user + now.system - own.user - own.system
-        found["workers_s"] = sum(seconds.values())
+def watched(client: subprocess.Popen[str]) -> dict[str, float]:
+    """Peak memory of the largest worker [MB], and processor seconds of a command and of all below it."""
+    peak_mb, seconds = 0.0, dict[int, float]()
+    above = psutil.Process(client.pid)
+    while client.poll() is None:
+        with contextlib.suppress(psutil.Error):
+            for process in (above, *above.children(recursive=True)):
+                if process.pid != client.pid:
+                    peak_mb = max(peak_mb, process.memory_info().rss / 1e6)
+                used = process.cpu_times()
+                seconds[process.pid] = used.user + used.system
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            client.wait(LOOK_S)
+    own = seconds.pop(client.pid)
+    return {"peak_mb": peak_mb, "client_s": own, "workers_s": sum(seconds.values())}
 
 
 def whole(folder: Path, cases: int, workers: int) -> dict[str, float]:
-    """A campaign from start to report."""
-    found: dict[str, float] = {}
+    """The command, from its start to its end: imports, workers' start and report are in it."""
+    out = folder / f"{cases}-{workers}"
+    command = [sys.executable, "-m", "hil.cli", "campaign", str(plan_file(folder, cases))]
+    command += ["-o", str(out), "-j", str(workers), "--json"]
     begin = time.perf_counter()
-    with watched(found):
-        result = campaign(plan_file(folder, cases), folder / f"{cases}-{workers}", workers=workers)
-    size = sum(path.stat().st_size for path in (result.folder.path / "rows").iterdir())
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as client:
+        found = watched(client)
+        told = json.loads(client.communicate()[0])
     wall = time.perf_counter() - begin
-    return found | {"wall_s": wall, "passed": result.passed, "bytes_a_case": size / cases}
+    size = sum(path.stat().st_size for path in (out / "rows").iterdir())
+    return found | {"wall_s": wall, "passed": told["passed"], "bytes_a_case": size / cases}
 
 
 def beside_motulator(python: str, case_ms: float) -> dict[str, Any]:

@@ -10,6 +10,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,14 +26,25 @@ Row = dict[str, Any]
 Span = tuple[int, int]
 IN_FLIGHT: Final = 4
 """Batches a worker has waiting, so that it never waits for one; no more, so that memory stays bounded."""
+SMALLEST: Final = 8
+"""Into so many pieces a batch is cut at the end of a campaign."""
 LOSSES: Final = 3
 """Workers that may die with a batch before it is cut in two."""
 MEMORY: Final = "1GB"
 """A worker above it is ended and begun again; it needs a quarter."""
+FORKS: Final = sys.platform == "linux"
+"""Whether workers are forked off a process that has imported what they need; else each is begun anew."""
+PRELOAD: Final = ["distributed.nanny", "distributed.worker", "hil.campaign.case"]
 THREADS: Final = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+HASH_SEED: Final = "6640"
+"""Of text, that Dask gives its workers, too."""
 CONFIG: Final = {
     "distributed.scheduler.allowed-failures": LOSSES,
     "distributed.admin.tick.limit": "1h",
+    "distributed.admin.tick.interval": "5s",
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.worker.profile.enabled": False,
+    "distributed.worker.multiprocessing-method": "forkserver" if FORKS else "spawn",
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.pause": False,
@@ -59,11 +72,19 @@ class Workers:
     scheduler: str | None = None
 
 
-def batches(spans: Iterator[Span], size: int) -> Iterator[Span]:
-    """Spans cut into pieces of at most ``size``."""
+def batches(spans: Iterator[Span], size: int, left: int = 0, workers: int = 0) -> Iterator[Span]:
+    """Spans cut into pieces of at most ``size``.
+
+    Of ``left`` items in all the last go out in smaller pieces, so that ``workers`` end at about one time.
+    """
     for start, stop in spans:
-        for at in range(start, stop, size):
-            yield at, min(at + size, stop)
+        at = start
+        while at < stop:
+            fair = left // (2 * workers) if workers else size
+            end = min(stop, at + min(size, max(fair, size // SMALLEST, 1)))
+            left -= end - at
+            yield at, end
+            at = end
 
 
 def run_batch(job: Job, wanted: Identity, start: int, stop: int) -> list[Row]:
@@ -90,6 +111,27 @@ def run(job: Job, pieces: Iterator[Span], workers: Workers, take: Callable[[list
         _through(client, job, pieces, take)
 
 
+def begin_forks() -> None:
+    """Begin the process that local workers are forked from: it imports while this one goes on.
+
+    Signals of the terminal are for this process, which ends the workers: those have them blocked.
+    """
+    if not FORKS:
+        return
+    from multiprocessing import forkserver
+
+    forkserver.set_forkserver_preload(PRELOAD)
+    before = dict(os.environ)
+    os.environ.update(dict.fromkeys(THREADS, "1"), PYTHONHASHSEED=HASH_SEED)
+    signals = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, signals)
+        os.environ.clear()
+        os.environ.update(before)
+
+
 @contextlib.contextmanager
 def connected(workers: Workers) -> Iterator[Any]:
     """A client of the scheduler that is named, or of a local cluster for as long as the block runs."""
@@ -109,6 +151,7 @@ def connected(workers: Workers) -> Iterator[Any]:
         if workers.scheduler:
             yield stack.enter_context(_reached(library.Client, workers.scheduler))
             return
+        begin_forks()
         folder = stack.enter_context(
             tempfile.TemporaryDirectory(prefix="hil-campaign-", ignore_cleanup_errors=True)
         )

@@ -188,7 +188,7 @@ def finish(job: Any, held: Folder, used: Workers, size: int, seen: Seen | None) 
             seen(rate)
 
     with _kept(held):
-        engine.run(job, engine.batches(held.open_spans(), size), used, take)
+        engine.run(job, engine.batches(held.open_spans(), size, held.count - done, used.count), used, take)
     held.merge()
     passed = held.columns("passed")["passed"]
     write_page(held)

@@ -111,6 +111,18 @@ class Folder:
         """Some columns of all rows in the order of their cases; text as objects, no number as NaN."""
         return columns(self.parts(), names)
 
+    def rows(self, cases: Sequence[int]) -> dict[int, Row]:
+        """The rows of some cases by their number, in the memory of a part, valued as by :meth:`columns`."""
+        out: dict[int, Row] = {}
+        for part in self.parts():
+            places = np.flatnonzero(np.isin(read_columns(part, ["case"])["case"], cases))
+            if len(places):
+                found = read_columns(part, list(self.schema), places)
+                values = (column.tolist() for column in found.values())
+                rows = (dict(zip(found, row, strict=True)) for row in zip(*values, strict=True))
+                out |= {row["case"]: row for row in rows}
+        return out
+
     def done(self) -> npt.NDArray[np.bool_]:
         """Which cases have a row."""
         out = np.zeros(self.count, np.bool_)
@@ -178,13 +190,14 @@ def _cell(value: Any, kind: Kind) -> Any:
     return float(value) if kind == "f8" else int(value)
 
 
-def read_columns(part: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Columns of one part as arrays. Raises HilError."""
+def read_columns(part: Path, names: Sequence[str], places: Any = None) -> dict[str, Any]:
+    """Columns of one part as arrays; ``places``: of these rows alone. Raises HilError."""
     pa = arrow()
     try:
         table = pa.parquet.read_table(part, columns=list(names))
     except (OSError, pa.ArrowException) as error:
         raise HilError(f"{part}: is no part of a campaign: {error}; remove it and --resume") from error
+    table = table if places is None else table.take(places)
     return {name: _array(table[name]) for name in names}
 
 

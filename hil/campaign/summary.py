@@ -6,6 +6,7 @@ Read column by column, so that memory is that of a few columns whatever the numb
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import binomtest, rankdata
 
 from hil.campaign.figures import KEYS, NAMES
 from hil.campaign.plan import PLANT, flat
@@ -21,6 +21,8 @@ from hil.campaign.store import INPUTS, Folder
 from hil.campaign.values import toml
 
 F8 = npt.NDArray[np.float64]
+Z95: Final = 1.959963984540054
+"""Quantile 0.975 of the normal distribution."""
 SHARES: Final = (0.0, 0.05, 0.5, 0.95, 1.0)
 WORST: Final = 5
 SMALLER_IS_WORSE: Final = (
@@ -56,11 +58,23 @@ class Difference:
 
 
 def interval(passed: int, count: int) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a share."""
+    """Wilson's 95 % confidence interval of a share p = passed / n.
+
+    (p + z^2/2n ± z sqrt(p (1 - p)/n + z^2/4n^2)) / (1 + z^2/n)   [Wilson 1927]
+    """
     if not count:
         return 0.0, 1.0
-    found = binomtest(passed, count).proportion_ci(0.95, method="wilson")
-    return float(found.low), float(found.high)
+    share, extra = passed / count, Z95 * Z95 / count
+    half = math.sqrt(extra * (share * (1.0 - share) + 0.25 * extra))
+    low, high = ((share + 0.5 * extra + sign * half) / (1.0 + extra) for sign in (-1.0, 1.0))
+    return max(0.0, low), min(1.0, high)
+
+
+def ranks_of(values: npt.NDArray[Any]) -> F8:
+    """Ranks from 1 on; values that are equal share the mean of theirs."""
+    _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+    ranks: F8 = np.cumsum(counts) - 0.5 * (counts - 1)
+    return ranks[place]
 
 
 def figure_of(held: Folder, key: str) -> F8:
@@ -100,9 +114,9 @@ def importance(held: Folder, key: str, figure: F8) -> float:
     if held.schema.get(key) in ("i8", "f8"):
         numbers = values.astype(np.float64)
         good = ~np.isnan(numbers) & ~np.isnan(figure)
-        return _correlation(rankdata(numbers[good]), rankdata(figure[good]))
+        return _correlation(ranks_of(numbers[good]), ranks_of(figure[good]))
     good = ~np.isnan(figure)
-    words, ranks = values[good].astype(str), rankdata(figure[good])
+    words, ranks = values[good].astype(str), ranks_of(figure[good])
     if len(ranks) < 3 or ranks.var() == 0:
         return 0.0
     groups = [ranks[words == word] for word in np.unique(words)]
@@ -149,13 +163,8 @@ def command(held: Folder, row: dict[str, Any]) -> str:
 
 def rows_at(held: Folder, cases: Sequence[int]) -> list[dict[str, Any]]:
     """The rows of some cases, in the order given."""
-    wanted: dict[int, dict[str, Any]] = {int(case): {} for case in cases}
-    for name in held.schema:
-        found = held.columns(name)
-        places = np.searchsorted(found["case"], list(wanted))
-        for case, place in zip(wanted, places, strict=True):
-            wanted[case][name] = _plain(found[name][place])
-    return [wanted[int(case)] for case in cases]
+    found = held.rows(cases)
+    return [found[int(case)] for case in cases]
 
 
 def worst(held: Folder, key: str, most: int = WORST) -> list[dict[str, Any]]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from hil.campaign.engine import Rate
 
 EVERY_S = 10.0
+MANY = 1000
+"""A plan of so many samples is not done in this process."""
 
 
 def register(commands: Commands) -> None:
@@ -103,7 +105,23 @@ def _case(args: argparse.Namespace) -> int:
     return EXIT_FAILED if args.strict and not row["passed"] else 0
 
 
+def _begin_early(args: argparse.Namespace) -> None:
+    """Begin what workers are forked from before this process imports, where they will surely be wanted."""
+    import tomllib
+
+    from hil.campaign.engine import begin_forks
+
+    try:
+        samples = tomllib.loads(args.what[0].read_text(encoding="utf-8")).get("samples")
+    except (OSError, ValueError):
+        return  # said by what reads it in earnest
+    many = isinstance(samples, int) and samples >= MANY
+    if not args.scheduler and (many if args.workers is None else args.workers > 0):
+        begin_forks()
+
+
 def _run(args: argparse.Namespace) -> int:
+    _begin_early(args)
     from hil.campaign.run import campaign
     from hil.report.view import key_values, show
 

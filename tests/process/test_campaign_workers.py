@@ -52,10 +52,15 @@ def started(*words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
 
 
-def workers(pid: int) -> list[psutil.Process]:
-    """The processes below one, but for the helpers that count shared memory."""
+def below(pid: int) -> list[psutil.Process]:
+    """The processes below one, but for the helper that counts shared memory."""
     found = psutil.Process(pid).children(recursive=True)
     return [p for p in found if "resource_tracker" not in " ".join(p.cmdline())]
+
+
+def workers(pid: int) -> list[psutil.Process]:
+    """Those that were forked off the one that has imported everything."""
+    return [p for p in below(pid) if p.ppid() != pid]
 
 
 def until(what: str, seconds: float = 240.0) -> Iterator[None]:
@@ -67,7 +72,9 @@ def until(what: str, seconds: float = 240.0) -> Iterator[None]:
     pytest.fail(f"never: {what}")
 
 
-def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path) -> None:
+@pytest.mark.parametrize("victim", ["worker", "source"])
+def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path, victim: str) -> None:
+    """What is killed: a worker, or what workers are forked off."""
     path = plan_file(tmp_path, 12.0)
     alone = hil.campaign(path, tmp_path / "alone", workers=0)
     assert alone.cases == CASES
@@ -76,9 +83,8 @@ def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path) -> Non
         if list((tmp_path / "lossy" / "rows").glob("part-*")):
             break
         assert process.poll() is None
-    victims = workers(process.pid)
-    assert victims
-    victims[0].send_signal(signal.SIGKILL)
+    worker = workers(process.pid)[0]
+    (worker if victim == "worker" else worker.parent()).kill()
     out, err = process.communicate(timeout=280)
     assert process.returncode == 0, err
     assert json.loads(out)["cases"] == CASES and "Traceback" not in err
@@ -92,13 +98,14 @@ def test_what_is_done_is_kept_and_gone_on_with_and_workers_end(tmp_path: Path) -
         if list((folder / "rows").glob("part-*")):
             break
         assert process.poll() is None
-    below = workers(process.pid)
+    all_below = below(process.pid)
+    assert len(all_below) >= 2
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=120)
     assert "Traceback" not in err
     assert process.returncode == 130
     for _ in until("the end of the workers"):
-        if not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in below):
+        if not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in all_below):
             break
     kept = int(store.open_folder(folder).done().sum())
     assert 0 < kept < CASES

@@ -15,6 +15,7 @@ from scipy.special import ndtri
 import hil
 from hil.campaign import store
 from hil.campaign.case import job_of, with_settings
+from hil.campaign.engine import batches
 from hil.campaign.figures import longest
 from hil.campaign.margins import DESIGN, design_margins
 from hil.campaign.normal import between, normal, root
@@ -358,6 +359,17 @@ def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path) -> None:
     assert first["ended"] == "stop_requested"
     assert unstable["ended"] != "stop_requested" and unstable["why"]  # no number in it
     assert second["ended"] == "refused" and "J_kg_m2" in second["why"] and not second["passed"]
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2, 7])
+def test_batches_cover_every_span_once_and_get_smaller_at_the_end(workers: int) -> None:
+    spans = [(0, 501), (600, 601), (700, 1300)]
+    pieces = list(batches(iter(spans), 100, 501 + 1 + 600, workers))
+    cases = [case for start, stop in pieces for case in range(start, stop)]
+    assert cases == [case for start, stop in spans for case in range(start, stop)]
+    sizes = [stop - start for start, stop in pieces]
+    assert max(sizes) == (100 if workers < 7 else 78) and min(sizes) >= 1
+    assert sizes[-1] <= (100 if workers == 0 else 12) and len(pieces) <= 13 + 20 * workers
 
 
 def test_a_folder_keeps_its_rows_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,9 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.stats import binomtest, rankdata
 
 import hil
 from hil.campaign import store, summary
@@ -81,6 +83,24 @@ def test_wilsons_interval() -> None:
     assert summary.interval(50, 100) == pytest.approx((0.4038, 0.5962), abs=1e-4)
     assert summary.interval(0, 0) == (0.0, 1.0)
     assert summary.interval(10, 10)[0] == pytest.approx(0.7225, abs=1e-4)
+
+
+def test_intervals_and_ranks_are_scipys() -> None:
+    for passed, count in ((0, 7), (3, 7), (7, 7), (999, 1000), (9_000, 10_000)):
+        low, high = binomtest(passed, count).proportion_ci(0.95, method="wilson")
+        assert summary.interval(passed, count) == pytest.approx((low, high), abs=1e-14)
+    values = np.array([3.0, -1.0, np.inf, 3.0, 0.0, -0.0, 3.0, 7.5])
+    np.testing.assert_array_equal(summary.ranks_of(values), rankdata(values))
+
+
+def test_rows_of_some_cases_are_those_of_their_columns_in_the_order_asked(made: Path) -> None:
+    held = store.open_folder(made)
+    found = held.columns(*held.schema)
+    rows = summary.rows_at(held, [23, 0, 7, 0])
+    wanted = [{name: values[case] for name, values in found.items()} for case in (23, 0, 7, 0)]
+    assert repr(rows) == repr(
+        [{k: getattr(v, "item", lambda v=v: v)() for k, v in w.items()} for w in wanted]
+    )
 
 
 def test_a_regression_is_found_case_by_case(
