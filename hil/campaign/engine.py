@@ -118,11 +118,12 @@ def begin_forks() -> None:
     """
     if not FORKS:
         return
-    from multiprocessing import forkserver
+    from multiprocessing import forkserver, resource_tracker
 
     forkserver.set_forkserver_preload(PRELOAD)
     before = dict(os.environ)
     os.environ.update(dict.fromkeys(THREADS, "1"), PYTHONHASHSEED=HASH_SEED)
+    resource_tracker.ensure_running()  # it unblocks the signals, so first
     signals = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         forkserver.ensure_running()

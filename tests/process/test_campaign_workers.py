@@ -112,6 +112,18 @@ def test_what_is_done_is_kept_and_gone_on_with_and_workers_end(tmp_path: Path) -
     assert hil.campaign(path, folder, workers=0, resume=True).cases == CASES
 
 
+def test_ctrl_c_while_everything_is_imported_is_one_line(tmp_path: Path) -> None:
+    """A terminal sends it to every process of the command."""
+    process = started(str(plan_file(tmp_path)), "-o", str(tmp_path / "out"), "-j", "2")
+    for _ in until("what workers are forked off"):
+        found = [p for p in below(process.pid) if "forkserver" in " ".join(p.cmdline())]
+        if found:
+            break
+    for one in (*found, process):
+        one.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=120) == ("", "hil: interrupted\n")
+
+
 def settled(*words: str) -> tuple[int, str, str]:
     process = started(*words)
     out, err = process.communicate(timeout=280)
