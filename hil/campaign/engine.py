@@ -48,6 +48,7 @@ CONFIG: Final = {
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.pause": False,
+    "distributed.worker.memory.monitor-interval": "500ms",
     "distributed.nanny.pre-spawn-environ": dict.fromkeys(THREADS, 1),
 }
 MISSING: Final = "campaigns need dask.distributed: pip install 'hil-drive[campaign]'"
