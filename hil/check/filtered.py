@@ -37,7 +37,8 @@ def filter_rows(setup: Setup, real: Any = None, w_noise: float = 0.0) -> list[Ro
     except ControlDesignError as error:  # of the real one: no run begins with such a one told
         return [Row(ROW, "warn", f"the emulated drive has {words(real)}: {error}", "take a shorter one")]
     loop = loop_through(config, setup.machine, given)
-    what = _which(real, told, given == believed)
+    what, shaft = _which(real, told, given == believed), config.motor.shaft
+    what += f", a shaft of {shaft.resonance_hz:g} Hz, which the observer knows" if shaft else ""
     if not loop.stable:
         return [Row(ROW, "fail", f"{what}: the loop is not stable", OWN)]
     noise = math.hypot(w_noise, setup.wire.x_lsb[0] / math.sqrt(12.0))

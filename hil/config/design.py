@@ -23,7 +23,7 @@ from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
 from hil.control.references import reference
 from hil.control.regen import RegenLimit
-from hil.control.registry import InnerLoop, SpeedFilter
+from hil.control.registry import InnerLoop, Shaft, SpeedFilter
 from hil.control.speedfilter import MOST_AVERAGE
 from hil.log.named import to_named
 from hil.signals import TickArray, new_ticks
@@ -198,7 +198,16 @@ def inner_loop(config: RunConfig, told: bool = True) -> InnerLoop | None:
     given = speed_filter(drive.speed_filter, config.loop.rate_hz)
     known = given if getattr(drive.speed_filter, "modelled", False) else None
     lag, every = drive.current_lag_ms * 1e-3, config.feedback_every
-    return InnerLoop(config.k_t / u_i, u_i, lag, drive.delay_ticks, told, known, every)
+    shaft = elastic_shaft(config.motor)
+    return InnerLoop(config.k_t / u_i, u_i, lag, drive.delay_ticks, told, known, every, shaft)
+
+
+def elastic_shaft(motor: MotorTable) -> Shaft | None:
+    """The shaft that the observer is to know."""
+    given = motor.shaft
+    if given is None:
+        return None
+    return Shaft(2.0 * math.pi * given.resonance_hz, given.damping_ratio, 1.0 / (1.0 + given.inertia_ratio))
 
 
 OTHER_MOTOR = 0.1

@@ -33,19 +33,30 @@ def refuse_unstable(where: str, config: RunConfig, machine: Machine, w_lsb: floa
     """
     table = config.drive.speed_filter
     given = speed_filter(table, config.loop.rate_hz)
-    every = config.feedback_every
-    if (given is None and every == 1) or machine.law["rows"][0]:  # an experiment closes no loop
+    every, shaft = config.feedback_every, config.motor.shaft
+    if (given is None and every == 1 and shaft is None) or machine.law["rows"][
+        0
+    ]:  # an experiment closes no loop
         return
     loop, command = loop_through(config, machine, given), config.command
     if not loop.stable and every > 1:
         seldom = f"the loop is not stable through {words(table)}, measured in each {every}th tick"
         remedy = "take a lower controller.speed_pole_rad_s, or let the drive send more often"
         raise ConfigError(where, [f"feedback.period_ms: {seldom}; {remedy}"])
+    if not loop.stable and shaft is not None:
+        soft = f"the loop is not stable on a shaft of {shaft.resonance_hz:g} Hz"
+        raise ConfigError(where, [f"motor.shaft: {soft}; take a lower controller.speed_pole_rad_s"])
     if not loop.stable:
         raise ConfigError(where, [f"drive.speed_filter: {_unstable(table)}"])
-    if given is None:
+    if given is None and shaft is None:
         return
     noise = loop.u_noise * w_lsb / math.sqrt(12.0)
+    if noise > command.most and shaft is not None:
+        found = (
+            f"to see through a shaft of {shaft.resonance_hz:g} Hz makes {noise:.2g} {command.unit} of noise"
+        )
+        remedy = f"limits allow {command.most:g}; take a longer observer.speed.delay_ms"
+        raise ConfigError(where, [f"motor.shaft: {found} of the frames' resolution alone, {remedy}"])
     if noise > command.most:
         raise ConfigError(
             where,

@@ -56,6 +56,20 @@ class IdentifiedTable(Table):
     """Ticks by which the echo of the commands is older than what acts; 0 for an honest one."""
 
 
+class ShaftTable(Table):
+    """An elastic shaft between motor and load that the observer of the law ``speed`` takes into its model.
+
+    What it does is then no part of the estimate, which is that of the torque on the load.
+    """
+
+    resonance_hz: Positive
+    """Resonance of the two inertias, at most a quarter of ``loop.rate_hz``."""
+    damping_ratio: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.01
+    """Damping of it."""
+    inertia_ratio: Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)] = 1.0
+    """Inertia of the load over that of the motor; J_kg_m2 is both."""
+
+
 class MotorTable(Table):
     """Parameters of a PMSM: what the controller believes. Amplitude-invariant dq, mechanical speed."""
 
@@ -75,6 +89,8 @@ class MotorTable(Table):
     """Moment of inertia J of motor and load together."""
     B_f_n_m_s: NonNegative = 0.0
     """Viscous friction B_f: torque over mechanical speed."""
+    shaft: ShaftTable | None = None
+    """The elastic shaft to the load, of a drive that takes a current or a torque; left out: a rigid one."""
     identified: IdentifiedTable | None = None
     """Where the values come from, when hil identify found them."""
 

@@ -68,6 +68,15 @@ class RunConfig(Table):
     faults: FaultsTable = FaultsTable()
 
     @model_validator(mode="after")
+    def _shaft_in_its_model(self) -> RunConfig:
+        if self.motor.shaft is not None and self.drive.takes == "voltage":
+            raise ValueError(
+                "motor.shaft: the drive takes voltages, and no law for those has the shaft in its model; "
+                "remove it, and give hil design --shaft"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _feedback_in_time(self) -> RunConfig:
         if problem := self._seldom():
             raise ValueError(problem)
@@ -103,10 +112,10 @@ class RunConfig(Table):
         if self.bus.sync == "kernel":
             return f'{said}: with bus.sync = "kernel" each SYNC is answered; take "loop"'
         known = self.drive.speed_filter.kind != "none" and self.drive.speed_filter.modelled
-        if self.loop.pacing == "timer" and known:
+        if self.loop.pacing == "timer" and (known or self.motor.shaft is not None):
             return (
                 f'{said}: with loop.pacing = "timer" the measurements slip from tick to tick, and the states '
-                'of drive.speed_filter are not to be known; take "feedback"'
+                'of drive.speed_filter and motor.shaft are not to be known; take "feedback"'
             )
         return ""
 

@@ -367,10 +367,10 @@ def _shortened(given: ChannelSpec, inner: InnerLoop | None, T_s: float) -> Chann
     every, values = 1 if inner is None else inner.every, given.values()
     ticks = whole_gaps(ticks_of(inner), every)
     if given.kind == "adaptive" and (ticks or every > 1):
-        of = "without drive.speed_filter" if ticks else "in each tick, no feedback.period_ms"
+        of = "without drive.speed_filter and motor.shaft" if ticks else "in each tick, no feedback.period_ms"
         raise ControlDesignError(
             f"observer.speed.kind adaptive: its thresholds are those of a speed {of}; take another kind"
-            + (", or leave the filter out" if ticks else "")
+            + (", or leave those out" if ticks else "")
         )
     delay = values.get("delay_ms")
     if (not ticks and every == 1) or given.kind == "dob" or delay is None:  # a dob has no window
@@ -390,7 +390,7 @@ def whole_gaps(ticks: int, every: int) -> int:
 
 def _taken(ticks: int, every: int, tick_ms: float) -> str:
     """What is taken of a window that is too short."""
-    states = f"the states of drive.speed_filter take {ticks * tick_ms:g} ms of it"
+    states = f"the states of drive.speed_filter and motor.shaft take {ticks * tick_ms:g} ms of it"
     if every == 1:
         return f"{states}, and nothing is left"
     seldom = f"measurements come every {every * tick_ms:g} ms (feedback.period_ms)"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -83,13 +84,31 @@ class SpeedFilter:
 
 
 @dataclass(frozen=True, slots=True)
+class Shaft:
+    """An elastic shaft between motor and load: ``resonance`` [rad/s], damping ratio, the motor's share of J.
+
+    With twist t: J_l dw_l/dt = k t + c dt/dt - T_L, k = resonance^2 J_m J_l / J, c = 2 damping k / resonance.
+    """
+
+    resonance: float
+    damping: float
+    share: float
+
+    @property
+    def elastic(self) -> tuple[float, float, float]:
+        """Resonance [Hz], damping ratio, the motor's share of J."""
+        return self.resonance / (2.0 * math.pi), self.damping, self.share
+
+
+@dataclass(frozen=True, slots=True)
 class InnerLoop:
     """What a drive with a current loop of its own makes of a command u [A or N m].
 
     ``k_u``: torque per unit of u [N m]; ``u_i``: unit of u per ampere of i_q; ``lag`` [s]: time constant of
     the current loop; ``delay``: ticks by which a command acts later than with the next latch; ``told``: the
     drive reports i_q; ``filter``: what the speed comes through, None: nothing that the observer is to
-    know; ``every``: ticks from one measurement to the next.
+    know; ``every``: ticks from one measurement to the next; ``shaft``: behind which the observer knows the
+    load to be.
     """
 
     k_u: float
@@ -99,6 +118,7 @@ class InnerLoop:
     told: bool = True
     filter: SpeedFilter | None = None
     every: int = 1
+    shaft: Shaft | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,9 @@ n - 1 ticks more than without a filter, by which the observer's window is shorte
 as before. To undo a filter costs noise, |r| and |p|: each pole multiplies it by (1 + l^2)^1/2 / (1 - l) and
 more, l = e^{-pole T_s}; a mean does not.
 
+A load behind an elastic shaft is known in the same way: z = (w, twist, w_load, filter's state), with d at the
+load, -T_L / J as ever. What the shaft does is then no part of d_hat.
+
 Of a drive that reports in every m-th tick alone the samples are those, y_{k-jm}, with F^m in F's place; what
 flowed is known of each tick all the same. All that n counts then takes m times as long.
 """
@@ -26,7 +29,7 @@ from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP
 from hil.control.jit import jit
 from hil.control.linalg import Array, condition, dot, exp, halvings_of, integral_exponential, inverse
-from hil.control.registry import InnerLoop, SpeedFilter
+from hil.control.registry import InnerLoop, Shaft, SpeedFilter
 
 MOST_AVERAGE: Final = 32
 """Ticks of the longest moving average."""
@@ -39,64 +42,110 @@ MOST_CONDITION: Final = 1e12
 
 
 def order_of(inner: InnerLoop | None) -> int:
-    """States of the filter that the observer takes into its model."""
-    if inner is None or inner.filter is None:
+    """States of filter and shaft that the observer takes into its model."""
+    if inner is None:
         return 0
-    return inner.filter.ticks or len(inner.filter.poles)
+    given = inner.filter or SpeedFilter()
+    return (given.ticks or len(given.poles)) + (2 if inner.shaft else 0)
 
 
 def ticks_of(inner: InnerLoop | None) -> int:
     """Ticks that an innovation needs for those states, besides the one or the gap that it is of."""
-    if inner is None or inner.filter is None:
+    if inner is None:
         return 0
-    return inner.filter.ticks or len(inner.filter.poles) * inner.every
+    averaged = inner.filter is not None and inner.filter.ticks
+    return order_of(inner) * (1 if averaged else inner.every)
 
 
-def sampled_filter(given: SpeedFilter, friction: float, gain: float, lag: float | None, T_s: float) -> Any:
-    """F (n, n), G, S, E (n,), C (n,) of z = (w, filter), w' = friction w + gain i + d; friction [1/s].
+def sampled_filter(
+    given: SpeedFilter,
+    friction: float,
+    gain: float,
+    lag: float | None,
+    T_s: float,
+    shaft: Shaft | None = None,
+) -> Any:
+    """F (n, n), G, S, E (n,), C (n,) of z = (w, shaft, filter), w' = friction [1/s] w + gain i + d.
 
     The current of a tick runs straight from its first sample to its last (``lag`` None), else as a
-    first-order lag; by u and b the effect on w is that of u alone.
+    first-order lag; by u and b the effect on w is that of u alone, but for the shaft's.
     """
-    A = _continuous(given, friction)
+    A, of_i, of_d = _continuous(given, friction, gain, shaft)
     n = len(A)
     whole = np.zeros((n + 3, n + 3))  # (z, i, its target or slope, d)
-    whole[:n, :n], whole[0, n], whole[0, n + 2] = A, gain, 1.0
+    whole[:n, :n], whole[:n, n], whole[:n, n + 2] = A, of_i, of_d
     if lag is None:
         whole[n, n + 1] = 1.0 / T_s
     elif lag:
         whole[n, n], whole[n, n + 1] = -1.0 / lag, 1.0 / lag
     step, _ = integral_exponential(whole, T_s, halvings_of(whole, T_s))
-    held, E = _held(A, gain, T_s), step[:n, n + 2]
+    held, E = _held(A, of_i, T_s), step[:n, n + 2]
     if lag is None:  # u = i + b / 2
         S = step[:n, n + 1] - 0.5 * step[:n, n]
     elif lag:  # i + (target - i)(1 - l) = i + b
         S = step[:n, n + 1] / (1.0 - step[n, n])
-        S = S - held * (S[0] / held[0])
+        S = S - held * _share_of_target(S, held, friction, lag, T_s, shaft)
     else:
         S = np.zeros(n)
-    S[0] = 0.0
+    if shaft is None:
+        S[0] = 0.0
     C = np.zeros(n)
-    C[min(1, n - 1)] = 1.0
+    C[(3 if shaft else 1) if given.poles or given.ticks else 0] = 1.0
     parts = step[:n, :n], held, S, E, C
     return _averaged(parts, given.ticks, T_s) if given.ticks else parts
 
 
-def _continuous(given: SpeedFilter, friction: float) -> Array:
-    """A of (w, filter): f' = p (w - f);  f'' = p q (w - f) - (p + q) f';  a mean: the angle turned."""
+def _share_of_target(
+    S: Array, held: Array, friction: float, lag: float, T_s: float, shaft: Shaft | None
+) -> float:
+    """What u counts of b: as it is without a shaft, which :func:`hil.control.speed.flowed` does not know."""
+    if shaft is None:
+        return float(S[0] / held[0])
+    alone = np.array([[friction, 1.0, 0.0], [0.0, -1.0 / lag, 1.0 / lag], [0.0, 0.0, 0.0]])
+    step, _ = integral_exponential(alone, T_s, halvings_of(alone, T_s))
+    one = np.array([[friction]])
+    return float(step[0, 2] / (1.0 - step[1, 1]) / _held(one, np.ones(1), T_s)[0])
+
+
+def _continuous(
+    given: SpeedFilter, friction: float, gain: float, shaft: Shaft | None
+) -> tuple[Array, Array, Array]:
+    """A of (w, shaft, filter), and what current and d do: f' = p (w - f);  f'' = p q (w - f) - (p + q) f'.
+
+    A mean has the angle turned; a shaft (twist, w_load).
+    """
+    mass, m = _masses(friction, shaft), 3 if shaft else 1
+    n = m + (1 if given.ticks else len(given.poles))
+    A, of_i, of_d = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    A[:m, :m] = mass
+    of_i[0] = gain / (shaft.share if shaft else 1.0)
+    of_d[m - 1] = 1.0 / (1.0 - shaft.share) if shaft else 1.0
     if given.ticks:
-        return np.array([[friction, 0.0], [1.0, 0.0]])
-    if len(given.poles) == 1:
-        (p,) = given.poles
-        return np.array([[friction, 0.0], [p, -p]])
-    p, q = given.poles
-    return np.array([[friction, 0.0, 0.0], [0.0, 0.0, 1.0], [p * q, -p * q, -(p + q)]])
+        A[m, 0] = 1.0
+    elif len(given.poles) == 1:
+        A[m, 0], A[m, m] = given.poles[0], -given.poles[0]
+    elif given.poles:
+        p, q = given.poles
+        A[m, m + 1], A[m + 1, 0], A[m + 1, m], A[m + 1, m + 1] = 1.0, p * q, -p * q, -(p + q)
+    return A, of_i, of_d
 
 
-def _held(A: Array, gain: float, T_s: float) -> Array:
+def _masses(friction: float, shaft: Shaft | None) -> Array:
+    """A of w, or of (w, twist, w_load)."""
+    if shaft is None:
+        return np.array([[friction]])
+    a = shaft.share
+    k = shaft.resonance * shaft.resonance * a * (1.0 - a)
+    c = 2.0 * shaft.damping * k / shaft.resonance
+    motor, load = [(friction - c) / a, -k / a, c / a], [c / (1.0 - a), k / (1.0 - a), -c / (1.0 - a)]
+    return np.array([motor, [1.0, 0.0, -1.0], load])
+
+
+def _held(A: Array, of_i: Array, T_s: float) -> Array:
     """Effect of a constant current of 1 on z."""
     _, integral = integral_exponential(A, T_s, halvings_of(A, T_s))
-    return integral[:, 0] * gain
+    held: Array = integral[:, 0] * of_i[0]
+    return held
 
 
 def _averaged(parts: Any, ticks: int, T_s: float) -> Any:
@@ -118,12 +167,27 @@ def _rows(F: Array, C: Array, count: int) -> Array:
     return np.array(rows)
 
 
-def _innovation(given: SpeedFilter, F: Array, T_s: float, every: int) -> Array:
-    """Weights r_j of y_{k-jm} that no z explains: characteristic polynomial of F^m, of a mean (q - a) q^M."""
-    weights = np.array([1.0, -(F[0, 0] if every == 1 else _rows(F, np.eye(len(F))[0], every + 1)[-1][0])])
+def _innovation(given: SpeedFilter, F: Array, T_s: float, every: int, masses: int) -> Array:
+    """Weights r_j of y_{k-jm} that no z explains: characteristic polynomial of F^m, of a mean (q - a) q^M.
+
+    That of the ``masses`` states of motor and shaft from the traces of powers, by Newton's identities.
+    """
+    own = F[:masses, :masses]
+    over = own if every == 1 else np.array([_rows(own, row, every + 1)[-1] for row in np.eye(masses)])
+    weights = _characteristic(over)
     for pole in given.poles:
         weights = np.convolve(weights, np.array([1.0, -exp(-pole * every * T_s)]))
     return weights
+
+
+def _characteristic(M: Array) -> Array:
+    """Coefficients of det(q - M), highest first."""
+    weights, power, traces = [1.0], np.eye(len(M)), []
+    for k in range(1, len(M) + 1):
+        power = np.array([[dot(row, column) for column in M.T] for row in power])
+        traces.append(math.fsum(np.diag(power)))
+        weights.append(-math.fsum(w * t for w, t in zip(reversed(weights), traces, strict=True)) / k)
+    return np.array(weights)
 
 
 def _reconstruction(given: SpeedFilter, F: Array, C: Array, every: int) -> Array:
@@ -167,17 +231,18 @@ def _known(r: Array, rows: Array, before: Array, inputs: tuple[Array, ...], ever
 
 def filter_params(inner: InnerLoop | None, friction: float, gain: float, T_s: float) -> dict[str, Any]:
     """The filter's part of LAW_PARAMS; empty without a filter. Raises ControlDesignError."""
-    if inner is None or inner.filter is None:
+    if inner is None or order_of(inner) == 0:
         return {}
-    given = inner.filter
+    given, shaft = inner.filter or SpeedFilter(), inner.shaft
     _check(given, T_s)
+    _check_shaft(given, shaft, T_s)
     _check_room(inner)
     every, more = inner.every, ticks_of(inner)
     lag = None if inner.told and every == 1 else inner.lag  # between two samples the model tells what flows
-    F, G, S, E, C = sampled_filter(given, friction, gain, lag, T_s)
+    F, G, S, E, C = sampled_filter(given, friction, gain, lag, T_s, shaft)
     n = len(F)
     rows, none = _rows(F, C, MAX_GAP), np.zeros((more + every, n))
-    r, p = _innovation(given, F, T_s, every), _reconstruction(given, F, C, every)
+    r, p = _innovation(given, F, T_s, every, 3 if shaft else 1), _reconstruction(given, F, C, every)
     v_u, v_s, v_d = _known(r, rows, none, (G, S, E), every)
     w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n * every)[:more], (G, S, E), every)
     scale = -math.fsum(v_d)
@@ -214,6 +279,23 @@ def _check(given: SpeedFilter, T_s: float) -> None:
         raise ControlDesignError(
             f"drive.speed_filter: a pole of {slow[0]:g} rad/s says nothing of the speed in a period; "
             "set a faster one in the drive"
+        )
+
+
+def _check_shaft(given: SpeedFilter, shaft: Shaft | None, T_s: float) -> None:
+    """Refuse a shaft beside a mean, and one whose vibration the sampling does not see or tell from others."""
+    if shaft is None:
+        return
+    if given.ticks:
+        raise ControlDesignError(
+            "motor.shaft: no observer has both a shaft and a moving average in its model; leave the shaft "
+            "out, or let the observer not know the average: drive.speed_filter.modelled = false"
+        )
+    hz, least, most = shaft.elastic[0], 1e-3 / (2.0 * math.pi * T_s), 0.25 / T_s
+    if not least < hz <= most:
+        raise ControlDesignError(
+            f"motor.shaft.resonance_hz = {hz:g}: at {1.0 / T_s:g} Hz the observer tells vibration of "
+            f"{least:.3g} to {most:g} Hz; change loop.rate_hz, or leave the shaft out"
         )
 
 

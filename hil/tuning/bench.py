@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.config.design import law_spec, motor_model, speed_filter
+from hil.config.design import elastic_shaft, law_spec, motor_model, speed_filter
 from hil.control.law import CASCADE, FAC, MTPA, PI, SPEED, LawSpec, MotorModel
 from hil.errors import HilError
 from hil.report.metrics import RECOVERED_RAD_S, find_step, operating
@@ -119,7 +119,7 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
 
     An identified motor brings its own noise, resolution included. Else the resolution of frames and modulator
     counts as noise of q / sqrt(12). A soft coupling of the plant's file is the elastic shaft where none is
-    given. Raises HilError.
+    given, and without one that which the observer knows. Raises HilError.
     """
     sensors, load, u_lsb, brake = (0.0, 0.0), None, 0.0, False
     if setup.config.emulator is not None:
@@ -130,6 +130,8 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         brake = kind == "brake"
         if plant.coupling is not None and not more.get("shafts"):
             more["shafts"] = (_elastic(plant.masses),)
+    if (known := elastic_shaft(setup.config.motor)) is not None and not more.get("shafts"):
+        more["shafts"] = (known.elastic,)
     own = {name: value for name, value in (given or {}).items() if value is not None}
     more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
     motor, (w_noise, i_q_noise, i_d_noise) = motor_model(setup.config.motor), noise_of(setup, sensors, own)

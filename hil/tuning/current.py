@@ -20,7 +20,18 @@ from hil.control.linalg import Array
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.control.speed import COMMANDS, flowed, latched
 from hil.control.speedfilter import MOST_AVERAGE
-from hil.tuning.loop import LOAD, NO_LIMIT, PULSE_I, PULSE_U, PULSE_W, Plant, Record, one_mass, sampled
+from hil.tuning.loop import (
+    LOAD,
+    NO_LIMIT,
+    PULSE_I,
+    PULSE_U,
+    PULSE_W,
+    Plant,
+    Record,
+    one_mass,
+    sampled,
+    two_masses,
+)
 from hil.tuning.sensitivity import Margins, margins_of, peak_of
 
 RESPONSE_S: Final = 1.0
@@ -41,10 +52,12 @@ def shaft_of(
     """The plant behind a current loop, exact for u and T_L held over a tick; x = (w, i, ..., filter).
 
     ``given`` filters the speed, whatever the observer knows of it; ``masses``: one inertia, or
-    :func:`hil.tuning.loop.two_masses`.
+    :func:`hil.tuning.loop.two_masses`; without them the shaft that the observer knows, or none.
     """
     given = given or SpeedFilter()
-    own, load = masses or one_mass(motor)
+    if masses is None:
+        masses = one_mass(motor) if inner.shaft is None else two_masses(motor, *inner.shaft.elastic)
+    own, load = masses
     n, f = len(own), 2 if len(given.poles) == 2 else int(bool(given.poles or given.ticks))
     A, B = np.zeros((n + f, n + f)), np.zeros((n + f, 2))
     A[:n, :n], B[:n, 1] = own, load

@@ -116,9 +116,14 @@ class Bench:
         return [self.plant(motor) for motor in (self.motor, *self.corners())]
 
     def plant(self, motor: MotorModel, at: Elastic | None = None) -> Plant:
-        """A motor, on an elastic shaft (Hz, damping, share) where one is given, behind what drives it."""
+        """A motor, on an elastic shaft (Hz, damping, share) where one is given, behind what drives it.
+
+        Without one on that which the observer knows.
+        """
         if self.inner is None:
             return shaft(motor, self.T_s, *at, self.brake) if at else rigid(motor, self.T_s)
+        if at is None and self.inner.shaft is not None:
+            at = self.inner.shaft.elastic
         inner = replace(self.inner, k_u=self.inner.k_u * motor.k_t / self.motor.k_t)
         masses = two_masses(motor, *at, self.brake) if at else None
         return shaft_of(motor, inner, self.filter, self.T_s, masses)

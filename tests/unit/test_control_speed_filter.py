@@ -258,7 +258,7 @@ def test_the_loop_is_judged_at_the_rate_of_its_measurements() -> None:
             ODRIVE,
             5,
             FTDOB,
-            "the states of drive.speed_filter take 10 ms of it, and at least one must be left",
+            "the states of drive.speed_filter and motor.shaft take 10 ms of it, and at least one must",
         ),
         (ODRIVE, 12, dataclasses.replace(FTDOB, delay=0.1), "takes 36 ticks of measurements in each 12th"),
         (
@@ -325,7 +325,7 @@ def test_the_loop_is_as_good_as_without_the_filter_when_it_is_known_and_bad_when
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (SpeedFilter(ticks=12), "the states of drive.speed_filter take 12 ms of it"),
+        (SpeedFilter(ticks=12), "the states of drive.speed_filter and motor.shaft take 12 ms of it"),
         (SpeedFilter(ticks=33), "33 periods, and 32 are kept at most"),
         (SpeedFilter((1e-4,)), "says nothing of the speed in a period"),
         (SpeedFilter((1e-3, 1e-3)), "no number of samples tells the speed behind it"),
