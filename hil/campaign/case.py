@@ -7,6 +7,7 @@ and its number alone: every cache here is of a pure function.
 from __future__ import annotations
 
 import contextlib
+import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from copy import copy
@@ -138,6 +139,10 @@ class Stand:
         yield room
         self._rooms.append(room)
 
+    def _said(self, error: Exception) -> str:
+        """The first line, with files as seen from the configuration: each worker has a folder of its own."""
+        return first_line(error).replace(f"{self.path.parent}{os.sep}", "")
+
     def run(self, case: int) -> dict[str, Any]:
         """The row of a case, whatever becomes of it."""
         settings = self.plan.settings(case)
@@ -154,9 +159,9 @@ class Stand:
             with self._room() as room:
                 return row | judged(setup, simulation, room)
         except REFUSALS as error:
-            return row | {"ended": "refused", "passed": False, "why": first_line(error)}
+            return row | {"ended": "refused", "passed": False, "why": self._said(error)}
         except Exception as error:  # noqa: BLE001 - one case that breaks is a row, not the end of the campaign
-            why = f"{type(error).__name__}: {first_line(error)}"
+            why = f"{type(error).__name__}: {self._said(error)}"
             return row | {"ended": "broke", "passed": False, "why": why}
 
 
@@ -292,9 +297,9 @@ def _named(value: Any, base: Path) -> list[Path]:
 def refuse_unknown(stand: Stand, where: str) -> None:
     """Refuse a plan whose base, or a key of it, can't be set at all. Raises HilError."""
     stand.simulation({}, None)
-    problems = []
+    problems, bases = [], [settings for _, settings in stand.plan.variants] or [{}]
     for key, values in stand.plan.listed().items():
-        found = [_why(stand, {key: value}) for value in values]
+        found = [_why_in_all(stand, bases, {key: value}) for value in values]
         unknown = [
             why for why in found if why is not None and ("unknown key" in why or "is not a table" in why)
         ]
@@ -312,6 +317,12 @@ def _named_by(key: str, text: str) -> str:
     """A problem that begins with the key as the plan has it."""
     plant, name = (PLANT, key[len(PLANT) :]) if key.startswith(PLANT) else ("", key)
     return f"{plant}{text}" if text.startswith(name) else f"{key}: {text}"
+
+
+def _why_in_all(stand: Stand, bases: list[Settings], settings: Settings) -> str | None:
+    """Why settings can't be in any variant; None when they can in one."""
+    found = [_why(stand, base | settings) for base in bases]
+    return None if None in found else found[0]
 
 
 def _why(stand: Stand, settings: Settings) -> str | None:

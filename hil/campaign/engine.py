@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import tempfile
+import types
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -154,6 +155,7 @@ def connected(workers: Workers) -> Iterator[Any]:
             yield stack.enter_context(_reached(library.Client, workers.scheduler))
             return
         begin_forks()
+        stack.enter_context(_without_main())
         folder = stack.enter_context(
             tempfile.TemporaryDirectory(prefix="hil-campaign-", ignore_cleanup_errors=True)
         )
@@ -169,6 +171,17 @@ def connected(workers: Workers) -> Iterator[Any]:
         )
         stack.enter_context(cluster)
         yield stack.enter_context(library.Client(cluster))
+
+
+@contextlib.contextmanager
+def _without_main() -> Iterator[None]:
+    """Workers import nothing of the program that asks: a script without ``if __name__`` would run in each."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = types.ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def _reached(client: Any, address: str) -> Any:

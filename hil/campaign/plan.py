@@ -269,7 +269,7 @@ class Builder:
             table.seed,
             table.samples,
             {f"criteria.{key}": value for key, value in table.criteria.items()},
-            tuple((name, flat(keys)) for name, keys in table.variants.items()),
+            tuple((name, bundle(keys)) for name, keys in table.variants.items()),
             self._lists("grid", table.grid),
             self._axes("corners", table.corners, lambda given, key: corners(given, self.own(key))),
             self._lists("list", table.rows),
@@ -373,6 +373,11 @@ def _is_leaf(value: Any) -> bool:
     """Whether a table is a distribution or a corner, and not the tables of a key."""
     words = {*NAMES, "percent", "kind", "dist", "distribution", "type", "low", "high", "min", "max"}
     return isinstance(value, dict) and bool(words & set(value))
+
+
+def bundle(given: Mapping[str, Any]) -> Settings:
+    """The settings of a variant; a table with a ``kind`` is a law or an observer as a whole."""
+    return flat(given, lambda value: "kind" in value)
 
 
 def flat(given: Mapping[str, Any], leaf: Any = lambda _: False, before: str = "") -> Settings:

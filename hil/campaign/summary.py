@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.campaign.figures import KEYS, NAMES
-from hil.campaign.plan import PLANT, flat
+from hil.campaign.plan import PLANT, bundle
 from hil.campaign.store import INPUTS, Folder
 from hil.campaign.values import toml
 
@@ -217,7 +217,7 @@ def paired(held: Folder, axis: str) -> dict[str, list[Difference]]:
 def follows(held: Folder, key: str) -> bool:
     """Whether a key is set by the variant, so that it differs with it."""
     variants = json.loads(held.about["plan"])["variants"]
-    return any(key in flat(keys) for keys in variants.values())
+    return any(key in bundle(keys) for keys in variants.values())
 
 
 def _groups(held: Folder, keys: Sequence[str]) -> npt.NDArray[np.int64]:

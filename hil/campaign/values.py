@@ -156,6 +156,8 @@ def span(percent: Any, own: Any) -> float:
     share = _percent(percent) if isinstance(percent, str) else number(percent, "percent")
     if not share > 0:
         raise ValueError(f"percent must be above 0, not {share:g}")
+    if own is None:
+        raise ValueError("the config has no such key to be about; is it spelt right?")
     if isinstance(own, bool) or not isinstance(own, int | float) or own == 0:
         raise ValueError("a percentage needs a value of the config other than 0 to be about")
     return float(own) * share / 100.0

@@ -124,6 +124,16 @@ def test_ctrl_c_while_everything_is_imported_is_one_line(tmp_path: Path) -> None
     assert process.communicate(timeout=120) == ("", "hil: interrupted\n")
 
 
+def test_a_script_that_guards_nothing_runs_once(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    arguments = f"{str(plan_file(tmp_path, 0.5))!r}, {str(tmp_path / 'out')!r}, workers=1"
+    script.write_text(
+        f"import hil\nprint('begins')\nprint(hil.campaign({arguments}).cases)\n", encoding="utf-8"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=240)
+    assert (done.stdout, done.stderr) == (f"begins\n{CASES}\n", "")
+
+
 def settled(*words: str) -> tuple[int, str, str]:
     process = started(*words)
     out, err = process.communicate(timeout=280)

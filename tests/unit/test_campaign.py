@@ -20,6 +20,7 @@ from hil.campaign.figures import longest
 from hil.campaign.margins import DESIGN, design_margins
 from hil.campaign.normal import between, normal, root
 from hil.campaign.plan import Plan, read_plan
+from hil.campaign.run import one_case
 from hil.campaign.values import distribution, toml
 from hil.cli import main
 from hil.errors import ConfigError
@@ -185,6 +186,10 @@ covariance = [[0.04, 0.0036], [0.0036, 0.0004]]
         ('[grid]\n"plant:motor.J_kg" = [1.0]', "plant:motor.J_kg: unknown key; did you mean 'J_kg_m2'?"),
         ('[grid]\n"controller.pole" = [1.0, 2.0]', "controller.pole: unknown key"),
         ('samples = 3\n[random]\n"nothing.here" = [1.0, 2.0]', "nothing.here"),
+        (
+            'samples = 3\n[random]\n"plant:motor.J_kg" = { percent = 20 }',
+            "plant:motor.J_kg: the config has no such key to be about; is it spelt right?",
+        ),
         ('[grid]\n"plant:load.7.torque_n_m" = [1.0]', "plant:load.7.torque_n_m"),
         (f"samples = 3\n[random]\n{J} = {{ normal = [0.01, -1.0] }}", "standard deviation above 0, not -1"),
         (f"samples = 3\n[random]\n{J} = {{ uniform = [2.0, 1.0] }}", "needs low < high"),
@@ -349,6 +354,34 @@ def test_a_law_that_asks_for_no_voltage_or_is_unstable_has_no_margins(
 ) -> None:
     setup = load_setup(CONFIGS / f"{config}.toml", Overrides(settings=settings))
     assert design_margins(setup) == dict.fromkeys(DESIGN)
+
+
+def test_a_variant_with_another_kind_of_law_replaces_the_whole_table(tmp_path: Path) -> None:
+    pi = """kind = "pi"
+speed_gain_as_rad = 0.39
+speed_integral_a_rad = 15.0
+current_gain_v_a = 6.0
+current_integral_v_as = 674.0
+"""
+    text = f"[variants.shipped]\n[variants.pi.controller]\n{pi}"
+    text += "[variants.soft.controller]\nspeed_pole_rad_s = 20.0\n"
+    path = plan_file(tmp_path, text)
+    assert plan_of(tmp_path, text).settings(2) == {"controller.speed_pole_rad_s": 20.0}
+    rows = hil.campaign(path, tmp_path / "out").rows()
+    assert [row["variant"] for row in rows] == ["shipped", "pi", "soft"]
+    assert [row["ended"] for row in rows] == ["stop_requested"] * 3
+    assert len({row["iae_rad"] for row in rows}) == 3
+
+
+def test_why_a_case_is_refused_names_no_folder_of_a_worker(tmp_path: Path) -> None:
+    """A row is the same wherever it was run: alone in place, or by a worker from its copies."""
+    text = """[grid]
+"plant:fault" = [[], [{ kind = "load", at_s = 0.1, torque_n_m = 1.0 }]]
+"""
+    path = plan_file(tmp_path, text)
+    (_, refused) = hil.campaign(path, tmp_path / "out").rows()
+    assert refused["why"] == "demo.toml: fault: a fault script needs the bus; use hil run or hil faults"
+    assert one_case(path, 1)["why"] == refused["why"]
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path) -> None:
