@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self
@@ -387,7 +387,7 @@ def check_format(path: Path, run: Mapping[str, str]) -> None:
         )
 
 
-def read_blocks(log: Log) -> Iterator[Block]:
+def read_blocks(log: Log) -> Generator[Block, None, None]:
     """Go through a log chunk by chunk; metadata, events and damage gather in ``log`` on the way.
 
     Raises LogError for what is no log of hil at all, or one of another version.
@@ -395,7 +395,7 @@ def read_blocks(log: Log) -> Iterator[Block]:
     return _read_parts(log) if len(log.parts) > 1 else _read_file(log)
 
 
-def _read_parts(log: Log) -> Iterator[Block]:
+def _read_parts(log: Log) -> Generator[Block, None, None]:
     """The files of a split run as one: header and kept state are the first part's, the result the last's."""
     damages = []
     for number, path in enumerate(log.parts):
@@ -427,7 +427,7 @@ def new_log(source: Source, node: str = "") -> Log:
     return Log(paths[0], new_ticks(0), parts=paths if len(paths) > 1 else (), node=node)
 
 
-def _read_file(log: Log) -> Iterator[Block]:
+def _read_file(log: Log) -> Generator[Block, None, None]:
     """One file."""
     one = _Pass(log)
     try:

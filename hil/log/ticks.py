@@ -92,22 +92,21 @@ class Ticks:
         self.form = form
 
     @cached_property
-    def _tags(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
-        """Where a record's tags are, and what they must be."""
-        at: list[int] = []
-        tags = b""
+    def _tags(self) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8]]:
+        """A record with nothing but its tags, and 0xFF where these are."""
+        tags, where = np.zeros((2, self.form.layout.itemsize), np.uint8)
+        fields: Any = self.form.layout.fields
         for number, _, kind in self.form.shape:
-            own = tag(number, _KINDS[kind])
-            fields: Any = self.form.layout.fields
-            start = fields[f"_{number}"][1]
-            at, tags = at + list(range(start, start + len(own))), tags + own
-        return np.array(at, np.int64), np.frombuffer(tags, np.uint8)
+            own = np.frombuffer(tag(number, _KINDS[kind]), np.uint8)
+            at = slice(fields[f"_{number}"][1], fields[f"_{number}"][1] + len(own))
+            tags[at], where[at] = own, 0xFF
+        return tags, where
 
     def fits(self, records: Records) -> bool:
         """True when every tag of the records is where the layout has it."""
         raw = records.view(np.uint8).reshape(len(records), self.form.layout.itemsize)
-        at, tags = self._tags
-        return bool((raw[:, at] == tags).all())
+        tags, where = self._tags
+        return not ((raw ^ tags) & where).any()
 
     def today(self, records: Records) -> TickArray:
         """Records of the form's layout as today's ticks."""

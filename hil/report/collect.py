@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,8 @@ from hil.config.design import Machine
 from hil.config.tables import RunConfig, validate
 from hil.control.law import exact_after
 from hil.errors import ConfigError, HilError
-from hil.log.reader import Log, Source, new_log, read_blocks
+from hil.log.ahead import ahead
+from hil.log.reader import Block, Log, Source, new_log, read_blocks
 from hil.replay import Replay, Verdict, machine_of
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
@@ -25,6 +26,7 @@ from hil.runtime.bus import frame_time, message_names
 from hil.signals import DriveState, TickArray
 from hil.tick.reasons import explain
 
+T = TypeVar("T")
 STOP_WEIGHT: Final = 1e6  # a close-up of an end outweighs that of any load step
 
 
@@ -52,6 +54,17 @@ class Run:
     """The first tick with a reason."""
     _safety: Any = None
     _state: int = int(DriveState.SWITCH_ON_DISABLED)
+
+    def take(self, blocks: Generator[Block, None, T]) -> T:
+        """Take all blocks of the log; return what their generator returns."""
+        while True:
+            try:
+                kind, records = next(blocks)
+            except StopIteration as end:
+                found: T = end.value
+                return found
+            if len(records):
+                (self.feed if kind == "ticks" else self.frames.feed)(records)
 
     def feed(self, ticks: TickArray) -> None:
         """Take the next ticks; what is no number in them is shown as that, not warned of."""
@@ -190,20 +203,22 @@ def named(runs: list[Run], *, alone: bool) -> list[Run]:
 def collect(source: Source, *, verify: bool = True, node: str = "") -> Run:
     """Read a log, and replay it when ``verify``; ``node``: one after the first. Raises LogError."""
     log = new_log(source, node)
-    run, again, more = Run(log, log.path.stem), Replay(log), verify
-    for block in read_blocks(log):
-        if not len(block.records):
-            continue
-        if block.kind == "ticks":
-            run.feed(block.records)
-            more = more and again.feed(block.records)
-        else:
-            run.frames.feed(block.records)
+    run = Run(log, log.path.stem)
+    verdict = run.take(ahead(log, _replaying if verify else read_blocks))
     with np.errstate(invalid="ignore", over="ignore"):
         run.responses.finish()
     if run.config is None and not run.config_problem:  # there was no tick
         run.read_config()
     log.node = node or next(iter(log.nodes), "")
-    if verify:
-        run.verdict = again.verdict()
+    run.verdict = verdict or run.verdict
     return run
+
+
+def _replaying(log: Log) -> Generator[Block, None, Verdict]:
+    """The blocks of a log; returns what a replay of its ticks says."""
+    again, more = Replay(log), True
+    for block in read_blocks(log):
+        if block.kind == "ticks":
+            more = more and again.feed(block.records)
+        yield block
+    return again.verdict()

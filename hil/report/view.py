@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,6 +15,8 @@ from rich.text import Text
 
 from hil.errors import plain
 from hil.signals import Reason
+
+REFRESH_S: Final = 0.1
 
 if TYPE_CHECKING:  # a table must not wait for the compiler and the bus
     from hil.replay import Verdict
@@ -169,11 +171,22 @@ def what_if_table(found: WhatIf) -> Table:
 
 @contextlib.contextmanager
 def progress(text: str, total: int | None) -> Iterator[Callable[[int], None]]:
-    """A progress bar on standard error for as long as the block runs; nothing where that is no terminal."""
+    """A progress bar on standard error for as long as the block runs; nothing where that is no terminal.
+
+    It has no thread of its own, beside which no log would be read in a second process.
+    """
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda _: None
         return
-    with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(escape(plain(text)), total=total)
-        yield lambda done: bar.update(task, completed=done)
+    with Progress(console=console, transient=True, auto_refresh=False) as bar:
+        task, shown = bar.add_task(escape(plain(text)), total=total), 0.0
+
+        def seen(done: int) -> None:
+            nonlocal shown
+            bar.update(task, completed=done)
+            if bar.get_time() - shown > REFRESH_S:
+                bar.refresh()
+                shown = bar.get_time()
+
+        yield seen
