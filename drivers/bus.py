@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import select
 import socket
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple, NoReturn, Protocol
 
@@ -16,7 +17,17 @@ import can
 import numpy as np
 
 from drivers.errors import LinkDown, LinkError, QueueFull
-from drivers.local import CLASSIC, EFF_FLAG, ERR_FLAG, FD, RTR_FLAG, LocalBus, check_length, pack_frame
+from drivers.local import (
+    CLASSIC,
+    EFF_FLAG,
+    ERR_FLAG,
+    FD,
+    RTR_FLAG,
+    LocalBus,
+    check_length,
+    keep_out,
+    pack_frame,
+)
 
 _DOWN = {errno.ENETDOWN, errno.ENETUNREACH, errno.ENODEV, errno.ENXIO, errno.EBADF}
 _FULL = {errno.ENOBUFS, errno.EAGAIN}
@@ -80,7 +91,7 @@ class SocketLink:
     def __init__(
         self, bus: can.BusABC | None, receiving: socket.socket, sending: socket.socket, fd: bool = True
     ) -> None:
-        self._bus, self.receiving, self._sending, self._fd = bus, receiving, sending, fd
+        self._bus, self.receiving, self.sending, self._fd = bus, receiving, sending, fd
         receiving.setblocking(False)
         self._fds = [receiving.fileno()]
         self.fds = np.array([receiving.fileno(), sending.fileno(), 0, 0], np.int32)
@@ -102,6 +113,11 @@ class SocketLink:
             self._write(pack_frame(can_id, data, fd))
         except OSError as error:
             raise_link_error(error, "send")
+
+    def hear(self, ids: Collection[int], only: bool = True) -> None:
+        """Receive frames of these identifiers, with flags, alone; without ``only`` all but those."""
+        udp = self.receiving.family == socket.AF_INET
+        keep_out(self.receiving, self.sending.getsockname()[1] if udp else None, ids, only)
 
     def carries(self, fd: bool) -> bool:
         """True when a frame of this kind can be sent."""

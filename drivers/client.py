@@ -63,7 +63,7 @@ from drivers.record import bytes_of, cell_of
 from drivers.states import ENABLED, FAULT_RESET, codes_of, of_controlword, translator
 from drivers.stops import STOP_PAUSE_S, Outgoing, try_all
 from drivers.tables import command_values, incoming_tables, outgoing_tables, sent_offsets
-from drivers.wire import DATA_AT, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
+from drivers.wire import DATA_AT, FD_BYTES, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
@@ -155,13 +155,17 @@ class DriveClient:
         self._values: Any = values.data
         self._commanding = {"values": values, "messages": messages, "signals": signals}
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
-        for out in self._outgoing:
+        self._raws = np.concatenate([out.raw for out in self._outgoing])
+        for out, raw in zip(self._outgoing, np.split(self._raws, len(self._outgoing)), strict=True):
+            out.lay(raw)
             args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
             out.encode = partial(entry(encode_command, *args, 0), *args)
             noting = (self._log, self._state, out.raw)
             out.note = partial(entry(note_sent, *noting, 0), *noting)
-        self._on_change = dict.fromkeys(self.binding.map.on_change, b"")
-        """What of those messages was sent last."""
+        on_change = self.binding.map.on_change
+        self._seldom = np.array([out.message.name in on_change for out in self._outgoing], np.uint8)
+        self._held = np.zeros_like(self._raws)
+        """What was sent last of each message."""
         self._stops = [self._stop_frames(out) for out in self._outgoing]
         self._polls = self.binding.map.poll != ""
         self._sync = self._opening()
@@ -244,9 +248,10 @@ class DriveClient:
             if self._sync is not None and self._asks is None:
                 size = len(self._sync.view)
                 self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
-            if len(self._outgoing) == 1:
-                own = {"tick": raw, "raw": self._outgoing[0].raw, "fields": sent_offsets(tick.dtype)}
+            if len(self._outgoing) == 1 or not self._polls:
+                own = {"tick": raw, "raw": self._raws, "fields": sent_offsets(tick.dtype)}
                 own |= {"sync": self._sync.raw} if self._sync is not None and self._polls else {}
+                own |= {"seldom": self._seldom, "held": self._held}
                 self._command = self._port.commander(own | self._commanding)
         if self._sync is not None:
             rest(self._sync.raw)
@@ -437,7 +442,9 @@ class DriveClient:
         if self._command is not None and not self._cells[_DOWN]:
             code = self._begun(COMMANDED) or self._command()
             if code:
-                self._refuse(self._outgoing[0]) if code == REFUSED_COMMAND else self._fail(code)
+                if code <= REFUSED_COMMAND:
+                    self._refuse(self._outgoing[REFUSED_COMMAND - code])
+                self._fail(code)
         else:
             counter, controlword, u_q, u_d, T_L = self._sent_cells
             self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
@@ -463,12 +470,14 @@ class DriveClient:
         for out in self._outgoing:
             if self._polls and self._sync is not None:
                 self._sync.raw[: len(out.raw)] = out.raw
-            elif out.message.name not in self._on_change:
+            elif not (self._seldom[out.index] and (out.raw == self._last_sent(out)).all()):
                 self._send_noted(out, now_ns)
-            elif (data := bytes(out.view[DATA_AT:])) != self._on_change[out.message.name]:
-                self._send_noted(out, now_ns)
-                self._on_change[out.message.name] = data
+                self._last_sent(out)[:] = out.raw
         self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
+
+    def _last_sent(self, out: Outgoing) -> Any:
+        """The frame of a message that was sent last."""
+        return self._held[FD_BYTES * out.index : FD_BYTES * (out.index + 1)]
 
     def _send_noted(self, out: Outgoing, now_ns: int) -> None:
         """Send a command; of several the last that was laid out stands in the log's next place."""

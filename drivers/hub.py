@@ -1,17 +1,18 @@
-"""One link shared by the clients of several drives: each gets the frames that are its drive's.
+"""The link of each client of several drives on one bus: each gets the frames that are its drive's.
 
-A frame of nobody's goes to the first client, which notes what is foreign; an error frame goes to all.
+A frame of nobody's goes to the first client, which notes what is foreign; an error frame goes to all. On
+sockets of SocketCAN's frames each client has its own, and the kernel sorts; else a :class:`Hub` sorts.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from drivers.binding import Binding
-from drivers.bus import Frame, Link
+from drivers.bus import Frame, Link, SocketLink
 from drivers.local import ERR_FLAG
 
 READ_MOST: Final = 4096
@@ -22,6 +23,26 @@ def heard_ids(binding: Binding) -> set[int]:
     """Identifiers, with flags, of all that a drive sends and of what only its own controller may send."""
     own = [bound.message for bound in (*binding.incoming, *binding.outgoing)]
     return {m.send_id for m in (*own, binding.heartbeat, binding.emergency) if m is not None}
+
+
+def links_of(opened: Callable[[], Link], bindings: Sequence[Binding]) -> list[Link]:
+    """A link of one client each, over what ``opened`` opens. Raises LinkError, with none left open."""
+    links = [opened()]
+    if not isinstance(links[0], SocketLink):
+        return list(Hub(links[0], bindings).ports)
+    try:
+        others: set[int] = set().union(*map(heard_ids, bindings[1:]))
+        links[0].hear(others, only=False)
+        for binding in bindings[1:]:
+            links.append(link := opened())
+            assert isinstance(link, SocketLink)  # noqa: S101 - of the same bus as the first
+            link.hear(heard_ids(binding))
+            link.discard()  # what came before it heard its own alone
+    except BaseException:
+        for link in links:
+            link.close()
+        raise
+    return links
 
 
 class Hub:

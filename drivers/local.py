@@ -15,6 +15,7 @@ import socket
 import struct
 import time
 import zlib
+from collections.abc import Collection
 from typing import Any
 
 import can
@@ -56,13 +57,27 @@ def check_length(data: bytes, fd: bool) -> None:
         raise ValueError(f"{len(data)} bytes do not fit a {'CAN FD' if fd else 'classic CAN'} frame")
 
 
-def _drop_source_port(sock: socket.socket, port: int) -> None:
-    """Let the kernel drop datagrams whose UDP source port is ``port`` (a four-line classic BPF program)."""
-    load, jump, accept, drop = (0x28, 0, 0, 0), (0x15, 1, 0, port), (0x06, 0, 0, 0xFFFFFFFF), (0x06, 0, 0, 0)
-    program = b"".join(struct.pack("HBBI", *line) for line in (load, jump, accept, drop))
-    buffer = ctypes.create_string_buffer(program)
-    filter_program = struct.pack("HL", 4, ctypes.addressof(buffer))
-    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, filter_program)
+def keep_out(sock: socket.socket, port: int | None, ids: Collection[int] = (), only: bool = False) -> None:
+    """Let the kernel drop frames before the socket: a classic BPF program.
+
+    ``port``: UDP source port whose datagrams are dropped, None where the socket has no UDP. ``ids``:
+    identifiers, with flags, whose frames are dropped, or with ``only`` all others; error frames come through.
+    """
+    drop, accept = (0x06, 0, 0, 0), (0x06, 0, 0, 0xFFFFFFFF)
+    sources = [] if port is None else [(0x28, 0, 0, 0), (0x15, 0, 1, port), drop]
+    frame_at = 0 if port is None else 8
+    known = [(0x15, 0, 1, _as_loaded(can_id)) for can_id in sorted(ids)]
+    sort = [line for test in known for line in (test, accept if only else drop)]
+    head = [(0x20, 0, 0, frame_at), (0x45, 0, 1, _as_loaded(ERR_FLAG)), accept] if ids else []
+    lines = [*sources, *head, *sort, drop if only else accept]
+    buffer = ctypes.create_string_buffer(b"".join(struct.pack("HBBI", *line) for line in lines))
+    program = struct.pack("HL", len(lines), ctypes.addressof(buffer))
+    sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
+
+
+def _as_loaded(can_id: int) -> int:
+    """An identifier as the program sees it: a frame has it in the processor's order, a load is big endian."""
+    return int.from_bytes(struct.pack("=I", can_id), "big")
 
 
 def _loopback_index() -> int:
@@ -87,7 +102,7 @@ def open_sockets(channel: str, own: bool) -> tuple[socket.socket, socket.socket]
         sending.bind((LOOPBACK, 0))
         sending.connect((group, port))
         if not own:
-            _drop_source_port(receiving, sending.getsockname()[1])
+            keep_out(receiving, sending.getsockname()[1])
     except OSError:
         receiving.close()
         sending.close()

@@ -97,5 +97,5 @@ class SocketPort:
         return made
 
     def commander(self, own: Arrays) -> Callable[[], int]:
-        """:func:`drivers.posix.command` for one message."""
+        """:func:`drivers.posix.command` for the messages of a command."""
         return self._over(command, own, free=())

@@ -21,6 +21,7 @@ from drivers.frames import ENABLE_OPERATION, FOREIGN_COMMAND, FRESH
 from drivers.jit import array_at, jit, waiting
 from drivers.states import FAULT_RESET, state_of
 from drivers.wire import (
+    CLASSIC_BYTES,
     DATA_AT,
     FD_BYTES,
     FRAME,
@@ -54,7 +55,7 @@ EAGAIN: Final = 11
 DONE, HANDED_BACK, PENDING = range(3)
 """What a kernel returns: it is done; the caller has a frame to judge or the log is full; frames wait."""
 REFUSED_COMMAND: Final = -1000
-"""A value of the command fits no signal; other negative results are -errno."""
+"""A value of the command fits no signal: this and less by the message's place; others are -errno."""
 WAITS, LEFT = -1, -2
 """What :func:`follow` returns when it did nothing, or not all."""
 NO_WAIT_NS: Final = 1
@@ -81,12 +82,13 @@ ARRAYS: Final = {
     "fds": np.dtype("i4"), "times": np.dtype("i8"), "io": np.dtype("i8"), "raw": np.dtype("u1"),
     "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
     "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
-    "sync": np.dtype("u1"), "codes": np.dtype("i8"), "ear": np.dtype("i8"),
+    "sync": np.dtype("u1"), "codes": np.dtype("i8"), "ear": np.dtype("i8"), "seldom": np.dtype("u1"),
+    "held": np.dtype("u1"),
 }  # fmt: skip
 """The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
 kernels here, the others of :mod:`drivers.wire`."""
 FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST = range(8)
-STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES, EAR = range(8, 16)
+STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES, EAR, SELDOM, HELD = range(8, 18)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
 
 
@@ -308,9 +310,10 @@ def gather(values: Any, tick: Any, fields: Any) -> None:
 
 @jit
 def command(places: Any) -> Any:
-    """Lay out and send a tick's command of one message. Returns DONE, REFUSED_COMMAND or -errno.
+    """Lay out all messages of a tick's command, then send them. Returns DONE, REFUSED_COMMAND... or -errno.
 
-    One that the drive answers is laid in SYNC's place, from where :func:`exchange` sends it.
+    One that the drive answers is laid in SYNC's place, from where :func:`exchange` sends it. A ``SELDOM`` one
+    is sent when it is another than the one sent last, which is ``HELD``.
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, RAW, U1)
     values, fields = array_at(places, VALUES, F8), array_at(places, FIELDS, I8)
@@ -318,14 +321,48 @@ def command(places: Any) -> Any:
     state, words = array_at(places, STATES, STATE), array_at(places, WORDS, U4)
     tick, log = array_at(places, TICK, U1), array_at(places, LOG, FRAME)
     gather(values, tick, fields)
-    size = encode_command(raw, values, 0, messages, signals, state, words, log, now_ns(times))
-    if size == REFUSED:
-        return REFUSED_COMMAND
+    at_ns, size = now_ns(times), 0
+    for index in range(len(messages)):
+        one = raw[FD_BYTES * index : FD_BYTES * (index + 1)]
+        size = encode_command(one, values, index, messages, signals, state, words, log, at_ns)
+        if size == REFUSED:
+            return REFUSED_COMMAND - index
     sync, code = array_at(places, SYNC, U1), DONE
     for at in range(min(FD_BYTES, len(sync))):
         sync[at] = raw[at]
-    if len(sync) == 0:
+    if len(sync) == 0 and len(messages) == 1:
         code = transmit(fds, raw, size, state, log)
+    elif len(sync) == 0:
+        code = transmit_all(places, at_ns)
     if code == DONE:
         state[0]["last_sent"], state[0]["controlword"] = int(values[0]), int(values[1])
     return code
+
+
+@jit
+def transmit_all(places: Any, at_ns: int) -> Any:
+    """Send the messages of a command that are due, each noted as it goes. Returns DONE or -errno."""
+    fds, raw, state = array_at(places, FDS, I4), array_at(places, RAW, U1), array_at(places, STATES, STATE)
+    log, messages = array_at(places, LOG, FRAME), array_at(places, MESSAGES, MESSAGE)
+    seldom, held = array_at(places, SELDOM, U1), array_at(places, HELD, U1)
+    for index in range(len(messages)):
+        first = FD_BYTES * index
+        one, last = raw[first : first + FD_BYTES], held[first : first + FD_BYTES]
+        if seldom[index] != 0 and not differ(one, last):
+            continue
+        note(log, state[0], one, 0, at_ns)
+        code = transmit(fds, one, FD_BYTES if messages[index]["fd"] else CLASSIC_BYTES, state, log)
+        if code != DONE:
+            return code
+        for at in range(FD_BYTES):
+            last[at] = one[at]
+    return DONE
+
+
+@jit
+def differ(one: Any, other: Any) -> bool:
+    """Are two frames not equal?"""
+    found = False
+    for at in range(FD_BYTES):
+        found |= one[at] != other[at]
+    return found

@@ -16,7 +16,7 @@ from functools import partial
 from pathlib import Path
 
 from hil.errors import HilError
-from hil.runtime import fused
+from hil.runtime import fused, fusednodes
 from hil.runtime.fused import LAST, PHASES, Marks, mark_often, new_marks
 from hil.runtime.loop import Loop, Outcome
 
@@ -52,6 +52,7 @@ def run_metered(report: Path, words: list[str]) -> int:
         return outcome
 
     fused.whole_tick = partial(fused.whole_tick, marks=marks)
+    fusednodes.whole_nodes = partial(fusednodes.whole_nodes, marks=marks)
     Loop.run = run  # type: ignore[method-assign]
     return cli.main(words)
 

@@ -187,9 +187,15 @@ class Recorder:
         """The record that it is ready to store: a loop that writes it has a first tick like the others."""
         return self._record
 
-    def places(self, frames: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """What :func:`hil.log.push.push` stores :attr:`record` by, and rows of :attr:`frames`."""
-        both = (self._ticks, self._record), (self._frames, frames)
+    def places(
+        self, frames: npt.NDArray[np.void], node: int = 0
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """What :func:`hil.log.push.push` stores a node's record by, and rows of :attr:`frames`.
+
+        ``node``: place of it; its record is :attr:`record` or of :attr:`more_records`.
+        """
+        ring, record = [(self._ticks, self._record), *zip(self._more, self._more_records, strict=True)][node]
+        both = (ring, record), (self._frames, frames)
         ticks, more = (ring_places(ring, records.view(np.uint8)) for ring, records in both)
         return ticks, more
 

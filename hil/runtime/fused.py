@@ -55,6 +55,7 @@ from hil.runtime.loop import (
     BEGUN,
     COUNTER_JUMP,
     DECIDED,
+    DID,
     FRESH,
     HEARD,
     LOST,
@@ -78,7 +79,7 @@ from hil.runtime.loop import (
     wait_ns,
 )
 from hil.runtime.trouble import TROUBLE
-from hil.signals import ALL_MISSING, TICK
+from hil.signals import ALL_MISSING, TICK, TickArray
 from hil.tick.kernel import whole_at
 
 PHASES: Final = (
@@ -134,31 +135,51 @@ def whole_tick(
     receive = None if ports is None else {"sync": ports.exchange, "feedback": ports.follow}.get(plan.pacing)
     if ports is None or receive is None:
         return none_compiled
-    end = NEVER if plan.ticks is None else plan.ticks
-    timing = np.array(
-        [
-            plan.period_ns, plan.timeout_ns, ports.sync_bytes, end, wait_ns(plan, client.timed is not None),
-            plan.every, plan.together, plan.pacing == "feedback",
-        ],
-        np.int64,
-    )  # fmt: skip
-    shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
-    marks = np.zeros(0, np.int64) if marks is None else marks
+    timing = timing_of(plan, ports.sync_bytes, client.timed is not None)
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
-    arrays = [np.zeros(4, np.int64), shared, timing, recorder.record, marks, pace, request.cell]
-    rows = [place_of(table.reshape(-1), I8) for table in tables]
-    rows += [place_of(array, TICK if array is recorder.record else I8) for array in arrays]
-    asked = np.zeros(1, np.int64)
-    rows.append(place_of(asked if number is None else np.frombuffer(number, np.int64), I8))
-    call = partial(_compiled(), np.array(rows))
-    call.__dict__["alive"] = (client, machine, recorder, tables, arrays, asked)  # the places are of them
+    table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks)
+    call = partial(_compiled(), table)
+    call.__dict__["alive"] = (client, machine, recorder, alive)  # the places are of them
     return call
+
+
+def timing_of(plan: Plan, sync_bytes: int, timed: bool) -> npt.NDArray[np.int64]:
+    """The plan, as compiled ticks read it."""
+    end = NEVER if plan.ticks is None else plan.ticks
+    row = [
+        plan.period_ns, plan.timeout_ns, sync_bytes, end, wait_ns(plan, timed), plan.every, plan.together,
+        plan.pacing == "feedback",
+    ]  # fmt: skip
+    return np.array(row, np.int64)
+
+
+def table_of(
+    tables: list[npt.NDArray[np.int64]],
+    timing: npt.NDArray[np.int64],
+    record: TickArray,
+    words: Words | None,
+    request: StopRequest,
+    pace: Pace,
+    number: memoryview | None,
+    marks: Marks | None,
+) -> tuple[npt.NDArray[np.int64], Any]:
+    """The table of a compiled tick, RECEIVE to NUMBER; beside it what must live as long.
+
+    ``tables``: RECEIVE to FRAMES_IN.
+    """
+    shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
+    marks, asked = np.zeros(0, np.int64) if marks is None else marks, np.zeros(1, np.int64)
+    arrays = [np.zeros(4, np.int64), shared, timing, record, marks, pace, request.cell]
+    rows = [place_of(table.reshape(-1), I8) for table in tables]
+    rows += [place_of(array, TICK if array is record else I8) for array in arrays]
+    rows.append(place_of(asked if number is None else np.frombuffer(number, np.int64), I8))
+    return np.array(rows), (tables, arrays, asked)
 
 
 def _compiled() -> Callable[..., int]:
     """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
     table = np.zeros((ROWS, 2), np.int64)
-    sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEXT + 1, REQUEST: 1, NUMBER: 1}
+    sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: DID + 1, REQUEST: 1, NUMBER: 1}
     known = {row: np.zeros(size, np.int64) for row, size in sizes.items()}
     known[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
     for row, array in known.items():

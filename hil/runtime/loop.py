@@ -28,8 +28,8 @@ Pace = npt.NDArray[np.int64]
 """ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many a compiled tick has taken
 of a queue that it left to the loop; SINCE: periods from the last tick with feedback to the one before. Of the
 last compiled call: RAN: ticks that it recorded; LOST: periods that it skipped; NEXT: number of the tick to go
-on with."""
-ARRIVED, HEARD, SINCE, RAN, LOST, NEXT = range(6)
+on with; DID: of several nodes' exchange or commands, how many steps are done."""
+ARRIVED, HEARD, SINCE, RAN, LOST, NEXT, DID = range(7)
 NOT_BEGUN, BEGUN, DECIDED, SENT, RECORDED = range(5)
 """Stages of a tick: SYNC is not out; SYNC is out, the drive has feedback to conclude; the law has run; the
 command is out, where there is one; the record is stored. What is left is done here."""
@@ -127,7 +127,7 @@ class Outcome:
 
 def new_pace() -> Pace:
     """All zero."""
-    return np.zeros(NEXT + 1, np.int64)
+    return np.zeros(DID + 1, np.int64)
 
 
 def none_compiled(_k: int, _deadline_ns: int, _log_failed: bool) -> int:

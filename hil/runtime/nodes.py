@@ -8,10 +8,12 @@ their tick is computed once more, from the same state, with that request as its 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from hil.config.design import Machine
 from hil.log.recorder import Recorder
@@ -19,15 +21,20 @@ from hil.ports import Clock, Inbox
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, GUARD_NS, Words, guardian_flags
 from hil.runtime.loop import (
     BUS_DOWN,
+    DECIDED,
+    DID,
     ENDED,
     FULL,
     SEND_FAILED,
     Cells,
     Loop,
     Outcome,
+    Pace,
     Plan,
     StopRequest,
+    Whole,
     bounded,
+    no_whole,
     transition_event,
 )
 from hil.runtime.trouble import TROUBLE, Trouble
@@ -37,6 +44,8 @@ COUNTERS: Final = GUARD_NS + 1
 """Word of the first node's newest command counter; those of the others follow."""
 ALONE: Final = (int(Reason.NONE), int(Reason.STOP_REQUESTED), int(Reason.NODE_STOPPED))
 """Reasons with which a node leaves the others as they are: each ends an orderly stop by its own ramp."""
+LEFT: Final = -1
+"""In place of how many commands are sent: none, the laws have run, and the others must stop with one."""
 SHARED: Final = ("k", "t_ns", "gap", "skipped", "lateness_ns", "request", "log_failed")
 NODE_STOPPED: Final = int(Request.NODE_STOPPED)
 
@@ -47,8 +56,8 @@ class Client(Protocol):
     def prepare(self, tick: Any) -> None:
         """Get ready for this very record."""
 
-    def sync(self, tick: Any) -> None:
-        """Send SYNC, for all nodes; what came before is taken as late."""
+    def exchange(self, tick: Any, deadline_ns: int) -> None:
+        """Send SYNC, for all nodes, then :meth:`receive`; what came before is taken as late."""
 
     def follow(self, tick: Any) -> None:
         """Take what came before another client's SYNC as late."""
@@ -64,6 +73,9 @@ class Client(Protocol):
 
     def flush(self) -> None:
         """Hand on the frames that came and went."""
+
+    def compiled(self) -> Any:
+        """What a compiled tick calls; None: the loop calls the methods."""
 
     def odd_length(self) -> str:
         """Which message came with another length than it should, in words."""
@@ -84,10 +96,14 @@ class Axis:
         self.outcome = Outcome()
         self.ended = False
         self.noted = int(DriveState.SWITCH_ON_DISABLED)
-        states = (machine.safety_state, machine.law_state, machine.setpoint_state)
-        self._live = [state.view(np.uint8) for state in states]
+        own = (machine.safety_state, machine.law_state, machine.setpoint_state)
+        self._live = [state.view(np.uint8) for state in own]
         self._kept = [live.copy() for live in self._live]
         client.prepare(self.tick)
+
+    def states(self) -> list[npt.NDArray[np.uint8]]:
+        """Bytes of its controller's states, then of what :meth:`decide` keeps of them."""
+        return [*self._live, *self._kept]
 
     def begin(self, first: Any) -> None:
         """Stamp the tick as the first node's."""
@@ -132,18 +148,32 @@ class Together:
     def prepare(self, tick: Any) -> None:
         """Done by each node."""
 
-    def exchange(self, tick: Any, deadline_ns: int) -> None:
-        """SYNC once, then each node's feedback; nothing is sent once the guardian has fired."""
-        words, first = self._words, self._axes[0]
-        for axis in self._axes[1:]:
+    def exchange(self, tick: Any, deadline_ns: int, did: int = 0) -> None:
+        """SYNC once, then each node's feedback; nothing is sent once the guardian has fired.
+
+        ``did``: how many of these steps a compiled tick has done: what came late of each node after the
+        first, SYNC with the first's feedback, the others' feedback.
+        """
+        first, *more = self._axes
+        steps = [*(partial(self.late, axis) for axis in more), partial(self.open, first, deadline_ns)]
+        steps += [partial(self.listen, axis, deadline_ns) for axis in more]
+        for step in steps[did:]:
+            step()
+
+    @staticmethod
+    def late(axis: Axis) -> None:
+        """What came late of a node; it stands before the SYNC in the log, too."""
+        axis.client.follow(axis.tick)
+        axis.client.flush()
+
+    def open(self, axis: Axis, deadline_ns: int) -> None:
+        """SYNC and the node's feedback."""
+        if self._words is not None and self._words[FIRED]:
             axis.client.follow(axis.tick)
-            axis.client.flush()  # what came late stands before the SYNC in the log, too
-        if words is not None and words[FIRED]:
-            first.client.follow(first.tick)
+            axis.client.receive(axis.tick, deadline_ns)
         else:
-            first.client.sync(first.tick)
-        for axis in self._axes:
-            self.listen(axis, deadline_ns)
+            axis.client.exchange(axis.tick, deadline_ns)
+        axis.client.flush()
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Each node's feedback."""
@@ -184,12 +214,15 @@ class NodesLoop(Loop):
         plan: Plan,
         request: StopRequest,
         words: Words | None = None,
+        whole: Callable[[Pace], Whole] = no_whole,
         inbox: Inbox | None = None,
     ) -> None:
         self._axes, self._more, self._rings = axes, axes[1:], recorder
         self._words: Any = words.cells if words else None
-        together, first = Together(axes, self._words), axes[0]
-        super().__init__(together, clock, recorder, first.step, first.ticks, plan, request, inbox=inbox)
+        self._together, first = Together(axes, self._words), axes[0]
+        super().__init__(
+            self._together, clock, recorder, first.step, first.ticks, plan, request, whole, inbox
+        )
         self._troubles = [Trouble(self._teller(axis)) for axis in self._more]
 
     def _teller(self, axis: Axis) -> Any:
@@ -203,9 +236,11 @@ class NodesLoop(Loop):
     def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int, begun: bool = False) -> int:
         """A tick of all nodes, each of which has feedback in every tick."""
         now, words = self._clock.now_ns, self._words
-        self._stamp(k, deadline_ns, gap, now_ns)
-        for axis in self._axes:
-            axis.begin(self._cells)
+        if not begun:
+            self._pace[DID] = 0
+            self._stamp(k, deadline_ns, gap, now_ns)
+            for axis in self._axes:
+                axis.begin(self._cells)
         if words is not None:
             words[BEAT_NS] = now()
         self._exchange(tick, deadline_ns, True)
@@ -214,13 +249,28 @@ class NodesLoop(Loop):
         for axis in self._axes:
             axis.cells.rx_flags[0] |= guarded
             axis.cells.received_ns[0] = received_ns
-        self._decide()
-        computed_ns = bounded(now() - deadline_ns)
-        for axis in self._axes:
-            axis.cells.computed_ns[0] = computed_ns
+        left = [axis.decide() for axis in self._axes]
+        self._pace[DID] = LEFT if any(left) else 0
+        self._computed(deadline_ns)
         self._answer(tick, deadline_ns)
         self._note(k, deadline_ns)
         return k
+
+    def _computed(self, deadline_ns: int) -> None:
+        """Once one has left by a fault or a quick stop, all stop in this tick; then the laws have run."""
+        if self._pace[DID] == LEFT:
+            for axis in self._axes:
+                axis.stop_too()
+            self._pace[DID] = 0
+        computed_ns = bounded(self._clock.now_ns() - deadline_ns)
+        for axis in self._axes:
+            axis.cells.computed_ns[0] = computed_ns
+
+    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> int:
+        """What is left of a tick, of which several nodes' may have stopped."""
+        if stage == DECIDED and self._pace[DID] == LEFT:
+            self._computed(deadline_ns)
+        return super()._rest(stage, tick, k, deadline_ns)
 
     def _states(self) -> tuple[int, ...]:
         """Of each node's supervisor."""
@@ -229,17 +279,11 @@ class NodesLoop(Loop):
     def _exchange(self, tick: Any, deadline_ns: int, due: bool) -> None:
         """SYNC out and feedback in; a SYNC that is not out is told to all."""
         try:
-            self._drive.exchange(tick, self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns))
+            until_ns = self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns)
+            self._together.exchange(tick, until_ns, self._pace[DID])
         except OSError as error:
             for axis in self._axes:
                 axis.cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
-
-    def _decide(self) -> None:
-        """Each node's controller; once one has left by a fault or a quick stop, all stop in this tick."""
-        left = [axis.decide() for axis in self._axes]
-        if any(left):
-            for axis in self._axes:
-                axis.stop_too()
 
     def _answer(self, tick: Any, deadline_ns: int) -> None:
         """The commands, in the configuration's order, unless the guardian has stopped the drives."""
@@ -249,7 +293,7 @@ class NodesLoop(Loop):
             for place, axis in enumerate(axes, COUNTERS):
                 words[place] = axis.counter[0]
             words[ARMED] = any(axis.cells.state[0] != DISARMED for axis in axes)
-        for axis in axes:
+        for axis in axes[self._pace[DID] :]:
             if axis.cells.send[0]:
                 self._command(axis)
             axis.cells.sent_ns[0] = bounded(self._clock.now_ns() - deadline_ns)

@@ -8,21 +8,23 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from drivers.client import DriveClient
-from drivers.hub import Hub
+from drivers.hub import links_of
 from hil.config.design import Machine
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder, check_folder
-from hil.runtime import realtime
+from hil.runtime import fused, fusednodes, realtime
 from hil.runtime.bus import opened_link
 from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import Rights, Words, guardian
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes
-from hil.runtime.loop import Outcome, StopRequest
+from hil.runtime.loop import Outcome, StopRequest, no_whole
 from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
 from hil.runtime.nodesetup import Nodes, check_nodes_load
 from hil.runtime.progress import say
@@ -60,6 +62,7 @@ def run_nodes(setups: Nodes, *, arm: bool = False, request: StopRequest | None =
             setup.machine.looped()
             with _said_of(name):
                 check_set_up(setup)
+        fusednodes.load()
         with _guarding(setups, recorder) as words:
             return _recorded(setups, request or StopRequest(), recorder, clock, words)
 
@@ -90,12 +93,12 @@ def _alone(setups: Nodes) -> Iterator[None]:
 def _clients(setups: Nodes, recorder: Recorder | None, clock: Clock | None) -> list[DriveClient]:
     """A client for each node on one link."""
     first = next(iter(setups.values()))
-    hub = Hub(opened_link(first), [setup.binding for setup in setups.values()])
+    links = links_of(partial(opened_link, first), [setup.binding for setup in setups.values()])
     on_frames = recorder.frames if recorder and first.config.log.frames else None
     now = clock.now_ns if clock else time.monotonic_ns
     return [
         DriveClient(port, one.database, on_frames=on_frames, now=now, drive_map=one.binding.map)
-        for port, one in zip(hub.ports, setups.values(), strict=True)
+        for port, one in zip(links, setups.values(), strict=True)
     ]
 
 
@@ -158,8 +161,13 @@ def _recorded(
             client.start()
             client.flush()
         box = inbox if any(takes.values()) else None
-        loop = NodesLoop(axes, clock, recorder, plan_of(first.config), request, words, box)
-        clients[0].discard()
+        plan = plan_of(first.config)
+        plan = replace(plan, together=fused.together(plan.period_ns, request))
+        whole = partial(fusednodes.whole_nodes, axes, words, recorder, plan, request, number=inbox.number)
+        real = whole if clock.name == "monotonic" else no_whole
+        loop = NodesLoop(axes, clock, recorder, plan, request, words, real, box)
+        for client in clients:
+            client.discard()
         return _run_armed(first, axes, loop, recorder, clock, request, takes)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import struct
 import time
 from collections.abc import Iterator
@@ -12,9 +14,9 @@ import cantools.database
 import numpy as np
 import pytest
 
-from drivers.bus import BusSettings, Frame, Link, open_link
+from drivers.bus import BusSettings, Frame, Link, SocketLink, open_link
 from drivers.client import DriveClient
-from drivers.errors import DatabaseError
+from drivers.errors import DatabaseError, LinkError
 from drivers.oneshot import NoAnswer
 from drivers.wire import FRAME
 from firmware_model.odrive import ODriveFrames
@@ -108,6 +110,37 @@ class Drive:
 
     def command(self, _counter: int, word: int, torque: float, _d: float) -> None:
         self.commands.append((word, torque))
+
+
+@pytest.mark.compiled
+def test_a_command_of_two_messages_is_one_compiled_call() -> None:
+    """The same frames as by the client in Python; one sent on change counts only once it was sent."""
+    said: list[list[bytes]] = []
+    for now in (time.monotonic_ns, lambda: 1):
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        theirs.setblocking(False)
+        setup, tick = setup_of(), new_ticks()[0]
+        link = SocketLink(None, ours, ours)
+        client = DriveClient(link, setup.database, drive_map=setup.binding.map, now=now)
+        client.prepare(tick)
+        assert (client.compiled() is not None) == (now is time.monotonic_ns)
+        sent: list[bytes] = []
+        for controlword, torque in ((0, 0.0), (15, 0.0), (15, 1.5), (15, -1.5), (0, 0.0)):
+            tick["controlword"], tick["u_q"] = controlword, torque
+            client.send(tick)
+            with contextlib.suppress(BlockingIOError):
+                while True:
+                    sent.append(theirs.recv(128))
+        said.append(sent)
+        theirs.close()
+        tick["controlword"] = 15
+        with pytest.raises(LinkError):
+            client.send(tick)
+        assert client._held[: len(sent[0])].tobytes() == sent[-2], "what was not sent is not what went last"
+        ours.close()
+    assert said[0] == said[1]
+    ids = [int.from_bytes(frame[:4], "little") for frame in said[0]]
+    assert ids == [STATE, TORQUE, STATE, TORQUE, TORQUE, TORQUE, STATE, TORQUE]
 
 
 def test_the_emulated_drive_takes_a_torque_in_mode_1_1_and_state_8_alone() -> None:

@@ -22,7 +22,7 @@ ROOT_MODULES = (
     "runtime/nodesetup",
 )
 ROOT_MODULES += ("cli", "runtime/configure", "sim/emulate", "sim/simulate", "sim/demo", "check/checks")
-ROOT_MODULES += ("runtime/fused",)
+ROOT_MODULES += ("runtime/fused", "runtime/fusednodes")
 ROOT_MODULES += ("faults/case", "exchange/rerun", "campaign/case", "replay/frames", "replay/sent")
 ROOT_MODULES += ("manual/schema",)
 JIT = "drivers.jit"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.bus import Frame
-from drivers.hub import READ_MOST, Hub, heard_ids
-from drivers.local import ERR_FLAG
+from drivers.bus import BusSettings, Frame, SocketLink, open_link
+from drivers.errors import LinkError
+from drivers.hub import READ_MOST, Hub, heard_ids, links_of
+from drivers.local import EFF_FLAG, ERR_FLAG, RTR_FLAG, pack_frame
 from firmware_model.bench import Bench
 from firmware_model.config import PlantConfig, Record, Wire, build_params, new_state
 from firmware_model.drive import advance
@@ -263,6 +265,44 @@ def test_each_client_gets_what_its_drive_sends() -> None:
     assert link.closed == 1
 
 
+@pytest.mark.parametrize("fd", [False, True])
+def test_on_sockets_the_kernel_sorts(fd: bool) -> None:
+    """The same as by a hub: each node has a socket, on which it hears its own; none hears what it sent."""
+    channel = f"sorted-{os.getpid()}-{fd}"
+    bus = BusSettings("hil-local", channel, fd=True)
+    links = links_of(lambda: open_link(bus), [setup.binding for setup in setups_of().values()])
+    other = open_link(bus)
+    sent = [(0x186, 0), (0x185, 0), (0x123, 0), (0x206, 0), (0x40, ERR_FLAG), (0x705, 0), (0x86, 0)]
+    sent += [(0x186, EFF_FLAG), (0x186, RTR_FLAG)]
+    assert isinstance(other, SocketLink)
+    for can_id, flags in sent:
+        other.send_raw(memoryview(pack_frame(can_id | flags, b"", fd)))
+    links[1].send(0x206, b"")
+    links[0].send(0x205, b"")
+    seen = [[], []]
+    for place, link in enumerate(links):
+        while (frame := link.receive(50_000_000)) is not None:
+            seen[place].append((frame.can_id, frame.flags))
+    motor, load = seen
+    assert motor == [sent[i] for i in (1, 2, 4, 5, 7, 8)] and load == [sent[i] for i in (0, 3, 4, 6)]
+    for link in (*links, other):
+        link.close()
+
+
+def test_no_link_stays_open_when_one_can_not_be_opened() -> None:
+    made: list[SocketLink] = []
+
+    def opened() -> Any:
+        if made:
+            raise LinkError(19, "no such bus")
+        made.append(open_link(BusSettings("hil-local", f"half-{os.getpid()}")))  # type: ignore[arg-type]
+        return made[0]
+
+    with pytest.raises(LinkError, match="no such bus"):
+        links_of(opened, [setup.binding for setup in setups_of().values()])
+    assert made[0].receiving.fileno() == -1
+
+
 def test_a_flood_for_one_does_not_hold_the_other() -> None:
     hub, link = hub_of(*[(0x185, 0)] * (READ_MOST + 10))
     assert hub.ports[1].receive(0) is None and len(link.frames) == 10
@@ -283,8 +323,7 @@ def test_what_came_late_is_logged_before_the_next_sync() -> None:
     clients = [SimpleNamespace(client=Noted(name), tick=None) for name in ("motor", "load")]
     Together(clients, None).exchange(None, 0)  # type: ignore[arg-type]
     assert did == [
-        "load follow", "load flush", "motor sync",
-        "motor receive", "motor flush", "load receive", "load flush",
+        "load follow", "load flush", "motor exchange", "motor flush", "load receive", "load flush",
     ]  # fmt: skip
 
 
