@@ -64,7 +64,7 @@ class ShaftTable(Table):
 
     resonance_hz: Positive
     """Resonance of the two inertias, at most a quarter of ``loop.rate_hz``."""
-    damping_ratio: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.01
+    damping_ratio: Annotated[float, Field(ge=0, le=0.99, allow_inf_nan=False)] = 0.01
     """Damping of it."""
     inertia_ratio: Annotated[float, Field(ge=1e-3, le=1e3, allow_inf_nan=False)] = 1.0
     """Inertia of the load over that of the motor; J_kg_m2 is both."""
