@@ -1,12 +1,14 @@
 """What a tuned loop does with the identified motor, and with a data sheet whose numbers are 30 % off.
 
-    python -m benchmarks.data_sheet [--json] [--seed 19] [--draws 3] [--effort 0.1] [NAME ...]
+    python -m benchmarks.data_sheet [--json] [--seed 19] [--draws 3] [--effort 0.1] [--bus] [NAME ...]
 
-Twelve motors of 50 W to 100 kW (benchmarks/motors.py), in the compiled loop of `hil simulate`. Each is
-identified by the four steps from a configuration that is 30 % off; `hil tune` designs for it, and the design
-runs on the true motor with friction and noise: the largest |w - w*| after a load step, beside the predicted
-dip. The data sheet has R_s, L, psi_f and J each 30 % too large or too small, by the seed; it knows the noise,
-and `hil tune` takes 30 % as the corners. Where no design keeps the usual margin there, --ms 4 is wished for.
+Twelve motors of 50 W to 100 kW (benchmarks/motors.py), one with cogging, one on a soft coupling, in the
+compiled loop of `hil simulate`. Each is identified by the steps of `hil identify` from a configuration that
+is 30 % off; `hil tune` designs for it, and the design runs on the true motor with friction and noise: the
+largest |w - w*| after a load step, beside the predicted dip. With --bus that run is on the lockstep bus, the
+emulator a process of its own. The data sheet has R_s, L, psi_f and J each 30 % too large or too small, by the
+seed; it knows the noise, and `hil tune` takes 30 % as the corners. Where no design keeps the usual margin
+there, --ms 4 is wished for.
 The load is a fifth of the torque at i_max, at most what brakes the shaft by 1000 rad/s2.
 """
 
@@ -22,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 from rich.table import Table
 
-from benchmarks.motors import MOTORS, NAMES, WRONG, Array, bench, plant, rewrite, settings
+from benchmarks.motors import COGGING, MORE, MOTORS, NAMES, WRONG, Array, bench, plant, rewrite, settings
 from hil.errors import HilError
 from hil.identify.plan import STEPS
 from hil.identify.session import Session, motor_toml, planned, setup_for
@@ -32,6 +34,7 @@ from hil.report.view import show
 from hil.runtime.setup import Overrides, load_setup
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.design import Wish
+from hil.tuning.verify import on_the_bus
 
 OFF: Final = 0.3
 WITHIN: Final = 0.15
@@ -41,24 +44,25 @@ AT_S: Final = 2.5
 JUDGED_S: Final = 0.4
 
 
-def identified(path: Path, true: dict[str, float]) -> str:
-    """The motor's file after the four steps. Raises HilError for a motor with a fault."""
+def identified(path: Path, true: dict[str, float], more: tuple[str, ...] = ()) -> str:
+    """The motor's file after all steps on a plant with ``more``. Raises HilError for a motor with a fault."""
     folder = path.parent
     path, config, emulated = bench(folder, true)
     session = Session(path, config, config.motor)
     for step in planned(session, STEPS):
-        session.note(step, simulate_ticks(setup_for(session, step), emulated))
+        session.note(step, simulate_ticks(setup_for(session, step), [*emulated, *more]))
     if session.faults:
         raise HilError("; ".join(session.faults))
     return motor_toml(session)
 
 
-def prepared(folder: Path, true: dict[str, float], wrong: Array) -> Path:
-    """A configuration that believes ``wrong`` times the truth, and the plant with the load step."""
+def prepared(folder: Path, true: dict[str, float], wrong: Array, more: tuple[str, ...] = ()) -> Path:
+    """A configuration that believes ``wrong`` times the truth; the plant with ``more`` and the load step."""
     path, _, _ = bench(folder, true)
     load = f'{{kind="step", torque_n_m={load_of(true)!r}, at_s={AT_S}, until_s={AT_S + 1.5}}}'
+    loads = [load, *(COGGING for one in more if COGGING in one)]
     own = folder / "plants" / "demo.toml"
-    rewrite(own, [*plant(true)[1:], f"load=[{load}]"])
+    rewrite(own, [*plant(true)[1:], *more, f"load=[{', '.join(loads)}]"])
     rewrite(path, [*settings(true, wrong), "loop.duration_s=3.5", "criteria={}"])
     return path
 
@@ -69,7 +73,9 @@ def load_of(true: dict[str, float]) -> float:
     return float(min(0.2 * k_t * true["i_max"], 1000.0 * true["J"]))
 
 
-def tuned(path: Path, motor: Path | None, true: dict[str, float], effort: float) -> dict[str, Any]:
+def tuned(
+    path: Path, motor: Path | None, true: dict[str, float], effort: float, *, bus: bool = False
+) -> dict[str, Any]:
     """What `hil tune` predicts, and what its configuration does on the true motor; ``ms``: its wish."""
     for ms in (MS, LOOSE_MS):
         wish = Wish(100.0 * true["u_max"] / 300.0, ms, max(2.2, ms), laws=("ftdob",), effort=effort)
@@ -80,15 +86,16 @@ def tuned(path: Path, motor: Path | None, true: dict[str, float], effort: float)
             continue
         to = path.with_name("tuned.toml")
         to.write_text(written(data, path, to), encoding="utf-8")
-        dip, predicted = dip_of(to), float(result["predicted"]["dip_rad_s"])
+        dip, predicted = dip_of(to, bus=bus), float(result["predicted"]["dip_rad_s"])
         worst = float(result["predicted"]["worst_dip_rad_s"])
         return {"ms": ms, "dip": dip, "predicted": predicted, "worst": worst, "ratio": dip / predicted}
     return {"ms": None, "refused": refused, "dip": None, "predicted": None, "ratio": None}
 
 
-def dip_of(path: Path) -> float:
+def dip_of(path: Path, *, bus: bool = False) -> float:
     """Largest |w - w*| after the load step [rad/s]; infinite for a run that was stopped before its end."""
-    own = operating(simulate_ticks(load_setup(path, Overrides())))
+    quiet = Overrides(settings=(f'log.folder="{path.parent}"',))
+    own = operating(on_the_bus(path, quiet, []) if bus else simulate_ticks(load_setup(path, Overrides())))
     t = (own["t_ns"] - own["t_ns"][0]) * 1e-9
     if len(t) == 0 or t[-1] < AT_S + JUDGED_S:
         return float("inf")
@@ -102,16 +109,19 @@ def draws(seed: int, count: int) -> list[Array]:
     return [1.0 + np.array([R_s, L, L, psi_f, 0.0, J, 0.0]) for R_s, L, psi_f, J in signs]
 
 
-def one_motor(name: str, seed: int, count: int, effort: float) -> dict[str, Any]:
+def one_motor(name: str, seed: int, count: int, effort: float, *, bus: bool = False) -> dict[str, Any]:
     """Both starts of one motor."""
+    more = MORE.get(name, ())
     true = dict(zip(NAMES, MOTORS[name], strict=True))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "demo.toml"
         file = Path(folder) / "identified.toml"
-        text = identified(path, true)
+        text = identified(path, true, more)
         file.write_text(text, encoding="utf-8")
-        found = tuned(prepared(path.parent, true, WRONG), file, true, effort)
-        sheets = [tuned(prepared(path.parent, true, off), None, true, effort) for off in draws(seed, count)]
+        found = tuned(prepared(path.parent, true, WRONG, more), file, true, effort, bus=bus)
+        sheets = [
+            tuned(prepared(path.parent, true, off, more), None, true, effort) for off in draws(seed, count)
+        ]
     return {"motor": name, "load_n_m": load_of(true), "identified": found, "data_sheet": sheets}
 
 
@@ -149,11 +159,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=19)
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--effort", type=float, default=0.1)
+    parser.add_argument("--bus", action="store_true", help="the identified one on the lockstep bus")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
     if unknown := [name for name in args.names if name not in MOTORS]:
         parser.error(f"no motor {', '.join(unknown)}; there are {', '.join(MOTORS)}")
-    found = [one_motor(name, args.seed, args.draws, args.effort) for name in args.names or MOTORS]
+    found = [
+        one_motor(name, args.seed, args.draws, args.effort, bus=args.bus) for name in args.names or MOTORS
+    ]
     if args.json:
         sys.stdout.write(json.dumps(found, indent=2) + "\n")
     else:

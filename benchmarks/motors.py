@@ -31,8 +31,9 @@ MOTORS: dict[str, tuple[float, ...]] = {
     "75 kW surface": (0.020, 0.5e-3, 0.5e-3, 0.40, 4, 0.40, 0.01, 2.5, 300, 310, 160),
     "100 kW interior": (0.012, 0.3e-3, 0.9e-3, 0.36, 4, 0.60, 0.02, 3.0, 400, 310, 180),
 }
+COGGING = '{kind="cogging", torque_n_m=0.05, order=36}'
 MORE: dict[str, tuple[str, ...]] = {
-    "1.5 kW interior": ('load=[{kind="cogging", torque_n_m=0.05, order=36}]',),
+    "1.5 kW interior": (f"load=[{COGGING}]",),
     "5.5 kW interior": ("coupling={inertia_ratio=1.0, resonance_hz=80.0}",),
 }
 """What else the plant of a motor has: cogging of half the Coulomb friction, a soft coupling."""

@@ -25,9 +25,9 @@ class IdentifiedTable(Table):
     logs: list[str] = Field([])
     """The runs that it was estimated from."""
     low: dict[str, Finite] = Field({})
-    """Lower ends of the 95 % intervals, by the motor's keys."""
+    """Lower ends of the 95 % intervals, by the motor's keys and those of its coupling here."""
     high: dict[str, Finite] = Field({})
-    """Upper ends of the 95 % intervals, by the motor's keys."""
+    """Upper ends of the 95 % intervals, by the motor's keys and those of its coupling here."""
     coulomb_n_m: NonNegative | None = None
     """Coulomb friction."""
     w_noise_rad_s: NonNegative | None = None
@@ -50,6 +50,12 @@ class IdentifiedTable(Table):
     """Standard deviation of that."""
     L_q_saturation_a: Positive | None = None
     """Current i_q at which psi_q / i_q has fallen to half of L_q_h by saturation; left out: none was seen."""
+    resonance_hz: Positive | None = None
+    """Where a soft coupling resonates with both ends free; left out: none was seen, the shaft is rigid."""
+    resonance_damping: Positive | None = None
+    """Damping ratio of that resonance."""
+    inertia_ratio: Positive | None = None
+    """Inertia behind the coupling over the motor's own; J_kg_m2 is both."""
     delay_ticks: Annotated[int, Field(ge=0, le=100)] | None = None
     """Ticks from sending a voltage to its effect."""
     echo_lag_ticks: Annotated[int, Field(ge=-100, le=100)] | None = None

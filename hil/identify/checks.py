@@ -39,9 +39,9 @@ def seen_in(step: Step, ticks: TickArray) -> Seen:
     text = f"the drive was at its limit, of supply or current, in {100 * limited:.0f} % of the ticks"
     more = (f"{text}: left out",) if limited else ()
     pulses = _pulses if step.controller.get("passes") else _currents
-    judged = {"sensors": _rest, "standstill": pulses, "spinning": _turns, "inertia": _turns}[step.name](
-        step, own
-    )
+    judged = {"sensors": _rest, "standstill": pulses, "spinning": _turns, "inertia": _turns, "shaft": _turns}[
+        step.name
+    ](step, own)
     return Seen(judged.faults, (*judged.findings, *more))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
+from hil.identify.coupling import SURE, seen
 from hil.identify.data import SHORTEST, Samples, joined, samples_of, turning
 from hil.identify.fit import Fit, Shaft, bending, first_sigma, fit, frozen
 from hil.identify.inner import InnerFit, evenly
@@ -29,6 +30,10 @@ PLAIN: Final = 0.25
 """Share of the noise's variance by which other pole pairs must fit better: below it noise alone decides."""
 ASTRAY: Final = (0.1, 10.0)
 """What a fit may leave of the speed: share of its motion within segments, and so many times its noise."""
+SHAFT: Final = ("resonance", "resonance_damping", "inertia_ratio")
+"""Parameters of a soft coupling, in the order of the fit's masses."""
+ALIASES: Final = 0.25
+"""Share of the rate above which a resonance is held against the one that the samples can't tell from it."""
 J_UNKNOWN: Final = 0.5
 """Share by which J may be off where no shaft turns freely."""
 BROKEN: Final = 4.0
@@ -39,7 +44,7 @@ UNITS: Final = {
     "coulomb": "N m", "load": "N m", "delay": "ticks", "lag": "s", "k_t_over_J": "rad/s2/A",
     "w_noise": "rad/s", "i_q_noise": "A", "i_d_noise": "A", "L_q_saturation": "A",
     "w_lsb": "rad/s", "i_q_lsb": "A", "i_d_lsb": "A", "arrival": "s", "arrival_jitter": "s",
-    "echo_lag": "ticks",
+    "echo_lag": "ticks", "resonance": "Hz", "resonance_damping": "1", "inertia_ratio": "J_l/J_m",
 }  # fmt: skip
 PLACES: Final = {
     "R_s": R_S, "L_d": L_D, "L_q": L_Q, "psi_f": PSI_F, "J": J, "B_f": B_F, "coulomb": COULOMB, "load": LOAD,
@@ -55,6 +60,7 @@ EXCITES: Final = {
     "B_f": "run-down over a range of speeds (step inertia)",
     "coulomb": "run-down over a range of speeds (step inertia)",
     "load": "runs in both directions (step inertia)",
+    "resonance": "a shaft that turns under torque that reverses (step shaft)",
 }
 
 
@@ -121,26 +127,108 @@ class Estimate:
         self.parameters[name] = Parameter(value, value - half, value + half, UNITS[name], not why, why)
 
 
-def estimate(runs: Sequence[TickArray], T_s: float, guess: MotorModel) -> Estimate:
-    """What the runs tell of the motor; ``guess`` starts the search and gives n_p."""
+def estimate(
+    runs: Sequence[TickArray], T_s: float, guess: MotorModel, pulses: Sequence[TickArray] = ()
+) -> Estimate:
+    """What the runs tell of the motor; ``guess`` starts the search and gives n_p.
+
+    ``pulses`` are runs that ring a soft coupling: without one they tell nothing else.
+    """
     out = Estimate()
-    parts = [part for part in (samples_of(ticks, T_s) for ticks in runs) if len(part) >= SHORTEST]
-    if not parts:
+    runs, pulses = (runs, pulses) if runs else (pulses, ())
+    everything = _everything(runs, T_s)
+    if len(everything) == 0:
         out.faults.append("no samples with the gates on and an unbroken past: nothing to estimate from")
         return out
-    everything = joined(parts)
-    samples = thinned(excited(everything.with_free(turning(everything))))
+    samples = turning_in(everything)
     if len(samples) < 50:
         _at_rest(out, everything)
         return out
-    samples, shaft = _without_disturbed(out, samples, guess)
-    found = _fitted(out, samples, guess, shaft)
+    whole = turning_in(_everything([*runs, *pulses], T_s)) if pulses else samples
+    found = _on_a_coupling(out, whole, guess)
+    if found is None:
+        samples, shaft = _without_disturbed(out, samples, guess)
+        found = _fitted(out, samples, guess, shaft)
     _note_parameters(out, found, guess)
+    note_masses(out, found)
     note_saturation(out, found)
     _note_noise(out, everything)
     _note_delay(out, runs, T_s, guess)
     _note_pole_pairs(out, guess)
     return out
+
+
+def _everything(runs: Sequence[TickArray], T_s: float) -> Samples:
+    """All samples of the runs."""
+    parts = [part for part in (samples_of(ticks, T_s) for ticks in runs) if len(part) >= SHORTEST]
+    if not parts:
+        return Samples(T_s, *(np.zeros(shape) for shape in (0, (0, 3), (0, 2), 0, 0, 0)))  # type: ignore[arg-type]
+    return joined(parts)
+
+
+def turning_in(samples: Samples) -> Samples:
+    """The excited ones, with where the shaft turns."""
+    return thinned(excited(samples.with_free(turning(samples))))
+
+
+def _on_a_coupling(out: Estimate, samples: Samples, guess: MotorModel) -> Fit | None:
+    """The fit of two inertias where a resonance shows and the data tell it; None for a rigid shaft."""
+    shows = seen(samples, guess)
+    if not shows.masses:
+        note_rigid(out, f"it takes {EXCITES['resonance']}" if shows.up_to == 0.0 else _stiff(shows.up_to))
+        return None
+    trial, start = Estimate(), rough(samples.segments(samples.free[samples.begins]), guess)
+    first = fit(samples, guess, start)  # what the coupling does not change is found by this faster one
+    found = _fitted(trial, samples, _as_motor(first, guess), replace(start, masses=shows.masses))
+    hz = shows.masses[0] / (2.0 * math.pi)
+    why = ""
+    if not found.masses or found.half[-1] > TOLD * found.value[-1]:
+        why = f"the speed rings at about {hz:.3g} Hz, but the data do not tell what is behind the coupling"
+    elif found.masses[0] * samples.T_s > 2.0 * math.pi * ALIASES and _aliased(samples, guess, found):
+        rate = 1.0 / samples.T_s
+        why = (
+            f"the speed rings at {hz:.3g} Hz or at {rate - hz:.4g} Hz: samples at {rate:g} Hz alias, they "
+            "can't tell which; it takes a higher loop.rate_hz"
+        )
+    if why:
+        out.findings.append(why)
+        note_rigid(out, why)
+        return None
+    out.samples, out.fit, out.white = trial.samples, found, trial.white
+    out.findings += trial.findings
+    return found
+
+
+def _stiff(up_to: float) -> str:
+    return f"no resonance is seen: up to {up_to:.0f} Hz a load as heavy as the motor would have shown"
+
+
+def note_rigid(out: Estimate, why: str) -> None:
+    """No soft coupling is told, and why."""
+    for name in SHAFT:
+        out.parameters[name] = Parameter(math.nan, math.nan, math.nan, UNITS[name], False, why)
+
+
+def _aliased(samples: Samples, guess: MotorModel, found: Fit) -> bool:
+    """Whether the samples fit as well with the resonance on the other side of half their rate."""
+    w_r, damping, ratio = found.masses
+    other = replace(found.shaft, masses=(2.0 * math.pi / samples.T_s - w_r, damping, ratio))
+    again = fit(samples, _as_motor(found, guess), other)
+    gain = 2.0 * float(samples.free.sum()) * math.log(float(again.sigma[0] / found.sigma[0]))
+    return gain < SURE**2
+
+
+def note_masses(out: Estimate, found: Fit) -> None:
+    """Of a soft coupling the resonance [Hz], its damping ratio and J_l / J_m."""
+    for name, value, half in zip(SHAFT, found.masses, found.half[-len(SHAFT) :], strict=False):
+        unit = 2.0 * math.pi if name == "resonance" else 1.0
+        out.put(name, value / unit, float(half) / unit)
+    if found.masses:
+        hz, _, ratio = found.masses
+        out.findings.append(
+            f"a soft coupling resonates at {hz / (2.0 * math.pi):.4g} Hz, with {ratio:.3g} times the motor's "
+            "inertia behind it; J is that of both"
+        )
 
 
 def excited(samples: Samples) -> Samples:
@@ -202,7 +290,7 @@ def _fitted(out: Estimate, samples: Samples, guess: MotorModel, shaft: Shaft) ->
         for begin, end in times(samples, bad):
             out.findings.append(f"left out: the load changed between {begin:.2f} and {end:.2f} s")
         samples = samples.segments(~bad)
-        found = fit(samples, _as_motor(found, guess), _as_shaft(found))
+        found = fit(samples, _as_motor(found, guess), found.shaft)
         found = found if found.saturation else bent(samples, guess, found)
     out.samples, out.fit = samples, found
     out.white = dict(zip(("w", "i_q", "i_d"), (float(p) for p in found.white), strict=True))
@@ -223,17 +311,12 @@ def astray(samples: Samples, found: Fit) -> bool:
 
 def bent(samples: Samples, guess: MotorModel, found: Fit) -> Fit:
     """The fit, again with a saturating L_q where its residuals ask for that and the data then tell it."""
-    motor, shaft = _as_motor(found, guess), _as_shaft(found)
+    motor, shaft = _as_motor(found, guess), found.shaft
     saturation = bending(samples, motor, shaft, found.sigma)
     if saturation == 0.0:
         return found
     again = fit(samples, motor, replace(shaft, saturation=saturation))
     return again if again.half[SATURATION] < again.value[SATURATION] else found
-
-
-def _as_shaft(found: Fit) -> Shaft:
-    """Friction, load and saturation of the fit."""
-    return Shaft(float(found.value[COULOMB]), float(found.value[LOAD]), found.saturation)
 
 
 def _as_motor(found: Fit, guess: MotorModel) -> MotorModel:
@@ -337,6 +420,7 @@ def _at_rest(out: Estimate, samples: Samples) -> None:
         out.put(name, float(value), 1.96 * float(value) / math.sqrt(2 * len(samples)))
     for name, how in EXCITES.items():
         out.parameters[name] = Parameter(math.nan, math.nan, math.nan, UNITS[name], False, f"it takes {how}")
+    note_rigid(out, f"it takes {EXCITES['resonance']}")
     if abs(mean[0]) > 6.0 * spread[0]:
         out.findings.append(f"the shaft turns at {mean[0]:.3g} rad/s without current: a load drives it")
 
@@ -378,7 +462,7 @@ def _refitted(out: Estimate, runs: Sequence[TickArray], T_s: float, guess: Motor
     parts = [part for part in (samples_of(run, T_s, delay) for run in runs) if len(part) >= SHORTEST]
     everything = joined(parts)
     out.samples = thinned(excited(everything.with_free(turning(everything))))
-    out.fit = fit(out.samples, _as_motor(out.fit, guess), _as_shaft(out.fit))
+    out.fit = fit(out.samples, _as_motor(out.fit, guess), out.fit.shaft)
     out.findings = [line for line in out.findings if "can't be told apart" not in line]
     _note_parameters(out, out.fit, guess)
 

@@ -19,14 +19,30 @@ from scipy.stats import t as student
 from hil.control.law import MotorModel
 from hil.control.linalg import Array
 from hil.identify.data import Samples
-from hil.identify.model import B_F, COULOMB, LOAD, N_P, PSI_F, SATURATION, J, outputs, responses
+from hil.identify.model import (
+    B_F,
+    COULOMB,
+    DAMPING,
+    LOAD,
+    N_P,
+    PSI_F,
+    RATIO,
+    RESONANCE,
+    RIGID,
+    SATURATION,
+    Flags,
+    J,
+    outputs,
+    responses,
+)
 
 WIDE: Final = 3.0
 """Deviation of ln(parameter) before the data: a factor of 20; keeps what they do not tell finite."""
 LEVEL: Final = 0.95
 COUNT: Final = LOAD + 1
-LOGS: Final = np.array([True, True, True, False, True, False, False, False, True])
-"""Which parameters are searched for by their logarithms."""
+MASSES: Final = (RESONANCE, DAMPING, RATIO)
+LINEAR: Final = (PSI_F, B_F, COULOMB, LOAD)
+"""Parameters that are not searched for by their logarithms."""
 SURE: Final = 6.0
 """Deviations by which L_q must seem to saturate before that is a parameter."""
 BENDS: Final = 0.02
@@ -37,21 +53,29 @@ BENDS: Final = 0.02
 class Shaft:
     """What starts the search besides the motor: Coulomb friction and constant load [N m].
 
-    ``saturation`` [1/A2]: that of L_q (:mod:`hil.identify.model`); 0: there is none.
+    ``saturation`` [1/A2]: that of L_q (:mod:`hil.identify.model`); 0: there is none. ``masses``: of a soft
+    coupling its resonance [rad/s], damping ratio and J_l / J_m; empty: the shaft is rigid.
     """
 
     coulomb: float = 0.0
     load: float = 0.0
     saturation: float = 0.0
+    masses: tuple[float, ...] = ()
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """Places in the model's vector of what is searched for."""
+        bends = (SATURATION,) if self.saturation > 0.0 else ()
+        return (*range(COUNT), *bends, *(MASSES if self.masses else ()))
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Parameters in the model's order (8,), their 95 % half-widths; residuals (N, 3), deviations (3,).
+    """Parameters (8,) at their ``places`` of the model, 95 % half-widths; residuals (N, 3), deviations (3,).
 
-    With saturation 9. ``told``: share of what was open before that the data closed; 0 nothing, 1 all.
-    ``white``: p-values of the three residuals' whiteness. ``cov``: of the search's numbers, times the squared
-    quantile that makes half-widths of its roots.
+    With saturation one more, on a soft coupling three. ``told``: share of what was open before that the data
+    closed; 0 nothing, 1 all. ``white``: p-values of the three residuals' whiteness. ``cov``: of the search's
+    numbers, times the squared quantile that makes half-widths of its roots.
     """
 
     value: Array
@@ -62,18 +86,29 @@ class Fit:
     output: Array
     white: Array
     cov: Array
+    places: tuple[int, ...]
 
     @property
     def saturation(self) -> float:
         """That of L_q [1/A2]; 0: none."""
-        return float(self.value[SATURATION]) if len(self.value) > COUNT else 0.0
+        return float(self.value[SATURATION]) if SATURATION in self.places else 0.0
+
+    @property
+    def masses(self) -> tuple[float, ...]:
+        """Of a soft coupling resonance [rad/s], damping ratio and J_l / J_m; empty for a rigid shaft."""
+        return tuple(float(x) for x in self.value[-len(MASSES) :]) if RATIO in self.places else ()
+
+    @property
+    def shaft(self) -> Shaft:
+        """Friction, load, saturation and masses."""
+        return Shaft(float(self.value[COULOMB]), float(self.value[LOAD]), self.saturation, self.masses)
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
     """Samples, pole pairs and scales: from the search's numbers x to outputs and weighted residuals.
 
-    x (8,), or with the saturation of L_q (9,).
+    ``places``: where the numbers stand in the model's vector.
     """
 
     samples: Samples
@@ -81,18 +116,29 @@ class Problem:
     start: Array
     unit: Array
     wide: Array
+    places: tuple[int, ...]
+
+    @property
+    def states(self) -> int:
+        """Of the model: two more on a soft coupling."""
+        return RIGID + (2 if RATIO in self.places else 0)
+
+    @property
+    def logs(self) -> Flags:
+        """Which numbers are logarithms."""
+        return ~np.isin(self.places, LINEAR)
 
     def motor(self, x: Array) -> Array:
         """The model's vector."""
-        logs, p = LOGS[: len(x)], np.zeros(N_P + 1)
-        p[: len(x)] = np.where(logs, np.exp(np.where(logs, x, 0.0)), x * self.unit)
+        p = np.zeros(RATIO + 1)
+        p[list(self.places)] = np.where(self.logs, np.exp(np.where(self.logs, x, 0.0)), x * self.unit)
         p[N_P] = self.n_p
         return p
 
     def output(self, x: Array, weight: Array) -> Array:
         """w, i_q, i_d (N, 3) from the best starts."""
         s = self.samples
-        z, out = np.empty((len(s), 4, 3)), np.empty((len(s), 3))
+        z, out = np.empty((len(s), self.states + 1, self.states)), np.empty((len(s), 3))
         responses(self.motor(x), s.T_s, s.y, s.u, s.begins, s.free, z)
         outputs(s.y, z, s.begins, weight, out)
         return out
@@ -115,7 +161,7 @@ class Problem:
     def used(self) -> int:
         """Degrees of freedom: outputs that count, less starts and parameters."""
         s = self.samples
-        return 2 * len(s) + int(s.free.sum()) - 3 * int(s.begins.sum()) - len(self.start)
+        return 2 * len(s) + int(s.free.sum()) - self.states * int(s.begins.sum()) - len(self.start)
 
     def solve(self, x: Array, weight: Array) -> Array:
         """Least squares, with what was known before as one more residual each."""
@@ -143,18 +189,20 @@ def problem(samples: Samples, motor: MotorModel, shaft: Shaft) -> Problem:
     one_way = len(way) == 0 or bool((way == way[0]).all())
     most = abs(motor.k_t) * max(float(np.abs(samples.y[:, 1]).max()), 1e-9) + shaft.coulomb
     fastest = max(float(np.abs(samples.y[:, 0]).max()), 1e-3)
-    unit = np.ones(COUNT)
+    places = shaft.places
+    unit = np.ones(len(places))
     unit[PSI_F], unit[B_F], unit[COULOMB], unit[LOAD] = abs(motor.psi_f), most / fastest, most, most
     first = np.array([motor.R_s, motor.L_d, motor.L_q, motor.psi_f, motor.J, motor.B_f, shaft.coulomb, 0.0])
     wide = np.array([WIDE, WIDE, WIDE, WIDE, WIDE, 1.0, 1.0, 1e-9 if one_way else 1.0])
     if len(way) == 0:
         wide[J] = wide[B_F] = 1e-9
     first[LOAD] = 0.0 if one_way else shaft.load
-    if shaft.saturation > 0.0:
-        first, unit, wide = np.append(first, shaft.saturation), np.append(unit, 1.0), np.append(wide, WIDE)
-    logs = LOGS[: len(first)]
+    more = [shaft.saturation] if shaft.saturation > 0.0 else []
+    first = np.append(first, [*more, *shaft.masses])
+    wide = np.append(wide, np.full(len(places) - COUNT, WIDE))
+    logs = ~np.isin(places, LINEAR)
     start = np.where(logs, np.log(np.where(logs, first, 1.0)), first / unit)
-    return Problem(samples, float(motor.n_p), start, unit, wide)
+    return Problem(samples, float(motor.n_p), start, unit, wide, places)
 
 
 def fit(samples: Samples, motor: MotorModel, shaft: Shaft, sigma: Array | None = None) -> Fit:
@@ -189,16 +237,16 @@ def _judged(one: Problem, x: Array, weight: Array) -> Fit:
     r, jacobian = one.residual(x, weight), one.jacobian(x, weight)
     cov, freedom = covariance(jacobian, r, one.samples, 1.0 / one.wide**2, one.used)
     deviation = np.sqrt(np.diag(cov))
-    value = one.motor(x)[: len(x)]
+    value = one.motor(x)[list(one.places)]
     quantile = float(student.ppf(0.5 + LEVEL / 2, freedom))
-    half = quantile * deviation * np.where(LOGS[: len(x)], value, one.unit)
+    half = quantile * deviation * np.where(one.logs, value, one.unit)
     residual = r / weight
     free = one.samples.free
     sigma = np.sqrt(np.mean(residual**2, axis=0))
     sigma[0] = np.sqrt(np.mean(residual[free, 0] ** 2)) if free.any() else np.nan
     told = 1.0 - np.minimum(deviation / one.wide, 1.0)
     out, white = one.samples.y - residual, whiteness(residual, one.samples)
-    return Fit(value, half, told, residual, sigma, out, white, quantile**2 * cov)
+    return Fit(value, half, told, residual, sigma, out, white, quantile**2 * cov, one.places)
 
 
 def covariance(J: Array, r: Array, samples: Samples, prior: Array, used: int) -> tuple[Array, float]:

@@ -15,7 +15,8 @@ from hil.config.tables import RunConfig, validate
 from hil.errors import ConfigError, HilError
 from hil.identify.estimate import Estimate
 from hil.identify.innerloop import estimate_for
-from hil.identify.motorfile import KEYS, motor_of
+from hil.identify.motorfile import KEYS, SHAFT_KEYS, motor_of
+from hil.identify.plan import excites_shaft
 from hil.log.parts import grouped
 from hil.log.reader import open_log
 from hil.signals import TickArray
@@ -65,7 +66,7 @@ def drift(runs: Sequence[Logged]) -> dict[str, dict[str, Any]]:
     ``drifts``: some two runs' 95 % intervals, widened by half for being many, do not meet.
     """
     out: dict[str, dict[str, Any]] = {}
-    for name in (*KEYS, "coulomb", "k_t_over_J", "lag"):
+    for name in (*KEYS, *SHAFT_KEYS, "coulomb", "k_t_over_J", "lag"):
         found = [run.found.parameters[name] for run in runs if name in run.found.parameters]
         told = [p for p in found if p.told]
         if len(told) < 2:
@@ -90,7 +91,10 @@ def from_logs(paths: Sequence[Path]) -> tuple[dict[str, Any], Estimate, MotorTab
     last = runs[-1].config
     whole = runs[0].found
     if len(runs) > 1:
-        whole = estimate_for(last, last.motor, [run.ticks for run in runs])
+        kinds_of = [
+            [run.ticks for run in runs if excites_shaft(run.config) is rings] for rings in (False, True)
+        ]
+        whole = estimate_for(last, last.motor, *kinds_of)
     result = {
         **whole.as_dict(),
         "logs": [str(run.path) for run in runs],

@@ -52,14 +52,19 @@ TREMBLES: Final = 200
 """Samples of motion below which friction is not told: in a tremble it falls with speed."""
 
 
-def estimate_for(config: RunConfig, motor: MotorTable, runs: Sequence[TickArray]) -> Estimate:
-    """What the runs tell of the motor of a configuration, by what its drive takes."""
+def estimate_for(
+    config: RunConfig, motor: MotorTable, runs: Sequence[TickArray], pulses: Sequence[TickArray] = ()
+) -> Estimate:
+    """What the runs tell of the motor of a configuration, by what its drive takes.
+
+    ``pulses``: those of the step ``shaft`` (:func:`hil.identify.estimate.estimate`).
+    """
     T_s = 1.0 / config.loop.rate_hz
     if config.drive.takes == "voltage":
-        out = of_voltages.estimate(runs, T_s, motor_model(motor))
+        out = of_voltages.estimate(runs, T_s, motor_model(motor), pulses)
     else:
         out = estimate(runs, config, motor)
-    note_facts(out, runs)
+    note_facts(out, runs or pulses)
     return out
 
 

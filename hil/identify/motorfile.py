@@ -29,8 +29,13 @@ FACTS: Final = {
     "arrival": ("arrival_ms", 1e3),
     "arrival_jitter": ("arrival_jitter_ms", 1e3),
     "L_q_saturation": ("L_q_saturation_a", 1.0),
+    "resonance": ("resonance_hz", 1.0),
+    "resonance_damping": ("resonance_damping", 1.0),
+    "inertia_ratio": ("inertia_ratio", 1.0),
 }
 """What else is told, its key in the table ``identified`` and by what it is multiplied there."""
+SHAFT_KEYS: Final = {name: FACTS[name][0] for name in ("resonance", "resonance_damping", "inertia_ratio")}
+"""Those of a soft coupling: they have intervals, too."""
 
 
 def motor_of(found: Estimate, before: MotorTable) -> MotorTable:
@@ -50,7 +55,7 @@ def number(value: float) -> str:
 
 def _interval_lines(found: Estimate, end: str) -> list[str]:
     lines = [f"[identified.{end}]"]
-    for name, key in KEYS.items():
+    for name, key in (KEYS | SHAFT_KEYS).items():
         p = found.parameters.get(name)
         if p is not None and p.told:
             value = getattr(p, end)

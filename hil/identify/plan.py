@@ -20,12 +20,16 @@ from hil.config.tables import RunConfig
 from hil.control.speedfilter import order_of
 from hil.errors import HilError
 
-STEPS: Final = ("sensors", "standstill", "spinning", "inertia")
+STEPS: Final = ("sensors", "standstill", "spinning", "inertia", "shaft")
 PASSES: Final = 14
 SPEED_SHARE: Final = 0.6
 """Speed of the experiments as a share of w_max_rad_s and of what the voltage gives."""
 CURRENT_SHARE: Final = 0.5
 """Torque current of the experiments as a share of i_max_a."""
+REVERSALS: Final = (0.45, 0.8, 0.55, 0.8, 0.6, 0.8, 0.5, 0.8, 0.45, 0.8, 0.55)
+"""Speeds at which the step ``shaft`` reverses its torque, as shares of the fastest: at times that differ."""
+REVERSAL_S: Final = 0.06
+"""Time from one of them to the next, about."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +153,45 @@ def inertia(config: RunConfig, motor: MotorTable) -> Step | Skipped:
     return Step("inertia", words, table, 4 * 2.2 + 1.5)
 
 
+def shaft(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Torque that reverses at speeds between which the shaft keeps turning, in both directions.
+
+    Its steps ring what a soft coupling has behind it.
+    """
+    w, most = top_speed(config, motor), CURRENT_SHARE * config.limits.i_max_a
+    k_t, span = 1.5 * motor.n_p * motor.psi_f_wb, 0.25 * w
+    first = min(max(motor.J_kg_m2 * w / (0.3 * k_t), 0.2 * most), most)
+    i = min(motor.J_kg_m2 * span / (REVERSAL_S * k_t) + 0.05 * most, most)
+    slew, rows = i / 0.005, []
+    for way in (1.0, -1.0):
+        rows.append((way * first, 0.0, way * 0.8 * w, 20 * first, 1.5))
+        up = [j % 2 == 1 for j in range(len(REVERSALS))]
+        rows += [
+            (way * i * (1.0 if rises else -1.0), 0.0, way * share * w, slew, 0.4)
+            for share, rises in zip(REVERSALS, up, strict=True)
+        ]
+        rows.append((0.0, 0.0, 0.15 * w, slew, 0.3))
+    table = _rows(*rows) | _torque(config, motor) | {"i_brake_a": 0.5 * i}
+    words = f"torque of {i:.3g} A that reverses at speeds from {0.45 * w:.3g} to {0.8 * w:.3g} rad/s"
+    return Step("shaft", f"{words}, in both directions", table, 2 * (1.5 + 0.15 * len(REVERSALS)) + 1.0)
+
+
+def own_shaft(config: RunConfig, motor: MotorTable) -> Step | Skipped:
+    """Left out: behind a current loop of its own the design rests on no shaft."""
+    return Skipped("shaft", f"a drive that takes a {config.drive.takes}: its inertia alone is told")
+
+
+def excites_shaft(config: RunConfig) -> bool:
+    """Whether a run is the step ``shaft``, by its configuration."""
+    law: Any = config.controller
+    return (
+        law.kind == "identify"
+        and config.drive.takes == "voltage"
+        and len(law.q) > len(REVERSALS)
+        and not law.passes
+    )
+
+
 def _fastest(config: RunConfig) -> float:
     """Change of the current in a tick [A] that the guard lets pass, with room."""
     u_i = config.drive_k_t if config.drive.takes == "torque" else 1.0
@@ -211,12 +254,14 @@ MAKE: Final[dict[str, Maker]] = {
     "standstill": standstill,
     "spinning": spinning,
     "inertia": inertia,
+    "shaft": shaft,
 }
 OWN_LOOP: Final[dict[str, Maker]] = {
     "sensors": own_sensors,
     "standstill": own_standstill,
     "spinning": own_spinning,
     "inertia": own_inertia,
+    "shaft": own_shaft,
 }
 """The same of a drive that takes a current or a torque."""
 
@@ -225,9 +270,9 @@ def make(name: str, config: RunConfig, motor: MotorTable) -> Step | Skipped:
     """A step with what is believed of the motor so far; Skipped when a limit does not allow it."""
     limits, w = config.limits, top_speed(config, motor)
     continuous = limits.i_continuous_a
-    if name in ("spinning", "inertia") and w < 20.0 * _still(config):
+    if name in ("spinning", "inertia", "shaft") and w < 20.0 * _still(config):
         return Skipped(name, f"limits allow {w:.3g} rad/s, too slow to tell from noise: w_max_rad_s, u_max_v")
-    if name == "inertia" and continuous and limits.i2t_max_a2s:
+    if name in ("inertia", "shaft") and continuous and limits.i2t_max_a2s:
         excess = (CURRENT_SHARE * limits.i_max_a) ** 2 - continuous**2
         if 6.0 * excess > limits.i2t_max_a2s:
             return Skipped(name, f"i2t_max_a2s = {limits.i2t_max_a2s:g} allows no run-up of 6 s")

@@ -35,12 +35,16 @@ UNFIT: Final = {
 
 @dataclass(slots=True)
 class Session:
-    """What is known so far: the motor believed in, the runs and what became of each step."""
+    """What is known so far: the motor believed in, the runs and what became of each step.
+
+    ``pulses`` are those of the step ``shaft``.
+    """
 
     path: Path
     config: RunConfig
     motor: MotorTable
     runs: list[TickArray] = field(default_factory=list)
+    pulses: list[TickArray] = field(default_factory=list)
     steps: list[dict[str, Any]] = field(default_factory=list)
     findings: list[str] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -58,10 +62,10 @@ class Session:
         seen = seen_in(step, ticks)
         self.faults += seen.faults
         self.findings += [f"{step.name}: {text}" for text in seen.findings]
-        self.runs.append(ticks)
+        (self.pulses if step.name == "shaft" else self.runs).append(ticks)
         if seen.faults:
             return
-        self.estimate = estimate_for(self.config, self.motor, self.runs)
+        self.estimate = estimate_for(self.config, self.motor, self.runs, self.pulses)
         self.faults += self.estimate.faults
         self.motor = motor_of(self.estimate, self.motor)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -21,7 +21,7 @@ from hil.config.tables import RunConfig, validate
 from hil.config.toml import override, read_toml
 from hil.errors import HilError
 from hil.runtime.setup import Overrides
-from hil.tuning.bench import speed_drive
+from hil.tuning.bench import coupled, identified_shafts, speed_drive
 from hil.tuning.design import Wish, design
 
 LEAST_SPREAD: Final = 0.01
@@ -72,6 +72,7 @@ def tune(
             if key in found
         },
         "margins": found["margins"],
+        "shaft": found["bench"]["shafts"][:1] if found["bench"]["elastic"] else [],
         "limited_by": found["limited_by"],
         "limits": limits_in_words(found["limited_by"], setup.config),
         "bench": found["bench"],
@@ -80,7 +81,9 @@ def tune(
     dip, recovery = float(best.verdict.nominal.dip), float(best.verdict.nominal.recovery_ms)
     result["predicted"] |= {"dip_rad_s": dip, "recovery_ms": recovery}
     result["predicted"] |= {"worst_dip_rad_s": float(best.verdict.worst.dip)}
-    result["yield"] = yield_of(path, data, motor, float(found["bench"]["load"]), dip, cases, seen)
+    result["yield"] = yield_of(
+        path, data, motor, float(found["bench"]["load"]), dip, cases, seen, identified_shafts(setup)
+    )
     return result, data
 
 
@@ -133,16 +136,24 @@ def _moved(value: Any, here: Path, there: Path) -> Any:
 
 def yield_of(
     path: Path, data: dict[str, Any], motor: MotorTable, load: float, dip: float, cases: int,
-    seen: Callable[[int], None],
+    seen: Callable[[int], None], shafts: Sequence[tuple[float, float, float]] = (),
 ) -> dict[str, Any] | None:  # fmt: skip
     """How many motors of the intervals keep the predicted dip; None without an emulated plant, or cases.
 
-    The load is a step of the design's size, as long as the run; friction is the plant's own.
+    The load is a step of the design's size, as long as the run; friction is the plant's own. ``shafts``: the
+    coupling that was identified and the ends of its intervals.
     """
     if cases == 0 or data.get("emulator") is None:
         return None
     keys = [key for group in GROUPS.values() for key in group]
     random = {f"plant:motor.{key}": {"uniform": list(interval(motor, key))} for key in keys}
+    coupling = coupled(shafts[0]) if shafts else []
+    for key, column in (
+        ("resonance_hz", [f for f, _, _ in shafts]),
+        ("inertia_ratio", [1 / s - 1 for _, _, s in shafts]),
+    ):
+        if column:
+            random[f"plant:coupling.{key}"] = {"uniform": [min(column), max(column)]}
     at = {"kind": "step", "torque_n_m": load, "at_s": 2.5, "until_s": 4.0}
     settings = [f"{name}={toml(table)}" for name, table in data.items() if isinstance(table, dict)]
     table = PlanTable.model_validate(
@@ -150,7 +161,7 @@ def yield_of(
             "config": str(path),
             "samples": cases,
             "set": [*settings, "loop.duration_s=5.0"],
-            "plant_set": [f"load=[{toml(at)}]"],
+            "plant_set": [f"load=[{toml(at)}]", *coupling],
             "random": random,
             "criteria": {"dip_max_rad_s": WITHIN * dip},
         }

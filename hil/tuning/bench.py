@@ -23,6 +23,8 @@ LATEST: Final = 4.0
 """Deviations of its arrival after which a measurement counts as there: one of 30,000 comes later."""
 QUIET_S: Final = 0.5
 """Time before the load step in which the noise of the command is measured."""
+LEAST_DAMPING: Final = 0.2
+"""Of an interval of the damping that reaches to 0 so much of the value is the lower end."""
 UNTOLD: Final = dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3)
 """Spread where none is given."""
 
@@ -118,10 +120,11 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
     """The bench of a config; ``given`` replaces load [N m], w_noise [rad/s], i_noise [A] of the plant's file.
 
     An identified motor brings its own noise, resolution included. Else the resolution of frames and modulator
-    counts as noise of q / sqrt(12). A soft coupling of the plant's file is the elastic shaft where none is
-    given, and without one that which the observer knows. Raises HilError.
+    counts as noise of q / sqrt(12). A soft coupling that was identified, else that of the plant's file, is
+    the elastic shaft where none is given, and without one that which the observer knows. Raises HilError.
     """
     sensors, load, u_lsb, brake = (0.0, 0.0), None, 0.0, False
+    known = identified_shafts(setup)
     if setup.config.emulator is not None:
         plant, _ = load_plant(path, setup.config)
         sensors = plant.sensors.w_noise_rad_s, plant.sensors.i_noise_a
@@ -129,9 +132,11 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         (load, kind), u_lsb = max(steps, default=(None, "")), plant.inverter.resolution_v
         brake = kind == "brake"
         if plant.coupling is not None and not more.get("shafts"):
-            more["shafts"] = (_elastic(plant.masses),)
-    if (known := elastic_shaft(setup.config.motor)) is not None and not more.get("shafts"):
-        more["shafts"] = (known.elastic,)
+            known = known or (_elastic(plant.masses),)
+    if known and not more.get("shafts"):
+        more |= {"shafts": known, "elastic": takes_voltage(setup)}
+    if (given_shaft := elastic_shaft(setup.config.motor)) is not None and not more.get("shafts"):
+        more["shafts"] = (given_shaft.elastic,)
     own = {name: value for name, value in (given or {}).items() if value is not None}
     more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
     motor, (w_noise, i_q_noise, i_d_noise) = motor_model(setup.config.motor), noise_of(setup, sensors, own)
@@ -151,6 +156,24 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         i_d_lsb=lsb_of(setup)[2],
         **more,
     )
+
+
+def identified_shafts(setup: Setup) -> tuple[tuple[float, float, float], ...]:
+    """The coupling that was identified, the corners of its intervals at the least damping; () for none."""
+    known = setup.config.motor.identified
+    if known is None or not (known.resonance_hz and known.resonance_damping and known.inertia_ratio):
+        return ()
+    hz, damping, ratio = known.resonance_hz, known.resonance_damping, known.inertia_ratio
+    lows, highs = ({"resonance_hz": hz, "inertia_ratio": ratio} | ends for ends in (known.low, known.high))
+    least = max(known.low.get("resonance_damping", damping), LEAST_DAMPING * damping)
+    corners = [
+        (min(low, 0.99 * value), max(high, 1.01 * value))
+        for low, high, value in (
+            (lows[key], highs[key], value) for key, value in (("resonance_hz", hz), ("inertia_ratio", ratio))
+        )
+    ]
+    ends = [(f, least, 1.0 / (1.0 + r)) for f in corners[0] for r in corners[1]]
+    return ((hz, damping, 1.0 / (1.0 + ratio)), *ends)
 
 
 def _elastic(shaft: Any) -> tuple[float, float, float]:

@@ -69,6 +69,7 @@ class Bench:
     Noises are standard deviations with the resolution in them; at the speed ``w_0`` [rad/s], where the
     axes are coupled; ``spread`` is the share by which J, psi_f, R_s
     and L may each be off; ``shafts`` are resonances (Hz, damping, motor's share of J) to stay stable with;
+    ``elastic``: the first of them is known to be there, so dip and recovery are those on it;
     ``brake``: the load step acts on the motor, not behind the shaft;
     ``i_d_noise`` is that of i_d with the resolution ``i_d_lsb`` [A] of its frame, which may be coarser than
     i_q's. Of a drive with a current loop of its own (``inner``) u is in its ``unit``, A or N m, and
@@ -84,6 +85,7 @@ class Bench:
     w_0: float = 0.0
     spread: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("J", "psi_f", "R_s", "L"), 0.3))
     shafts: tuple[Elastic, ...] = ()
+    elastic: bool = False
     brake: bool = False
     i_d_noise: float = 0.0
     i_d_lsb: float = 0.0
@@ -254,8 +256,7 @@ def _loop(w: Array, u: Array, T_s: float) -> Loop:
         return UNSTABLE
     if np.abs(u[-(len(u) // 10) :]).max() > 0.01:
         return UNSTABLE
-    outside = np.nonzero(error > RECOVERED_RAD_S)[0]
-    recovery = (int(outside[-1]) + 1) * T_s * 1e3 if len(outside) else 0.0
+    recovery = _recovery_ms(error, T_s)
     return Loop(float(error.max()), recovery, float(error.sum() * T_s), peak_of(u))
 
 
@@ -315,10 +316,31 @@ def foretold(law: Record, bench: Bench) -> list[tuple[float, float]]:
 
 def _ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> tuple[float, float]:
     """Of :func:`foretold`, where the vibration outlasts the response that a dip is read from."""
-    stepped, plant = to_unit_load(law, bench.load) if adapts(law) else law, bench.plant(motor, at)
-    w = responses(stepped, [plant], _STEP[:1], bench.ticks)[0, 0, 1 if own_loop(law) else 2]
-    dip = float(np.abs(w).max() * bench.load)
+    dip = float(np.abs(ringing(law, bench, motor, at)).max())
     return dip, noise(law, bench, motor, at, round(RINGING_S / bench.T_s))[0]
+
+
+def on_shaft(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, rigid: Loop) -> Loop:
+    """The measures on a rigid shaft with dip and recovery on an elastic one, which goes on to ring."""
+    if at is None or not rigid.stable:
+        return rigid
+    error = np.abs(ringing(law, bench, motor, at))
+    return replace(rigid, dip=float(error.max()), recovery_ms=_recovery_ms(error, bench.T_s))
+
+
+def ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> Array:
+    """The speed after the load step (ticks,)."""
+    stepped = to_unit_load(law, bench.load) if adapts(law) else law
+    plant = bench.plant(motor, at)
+    w: Array = (
+        responses(stepped, [plant], _STEP[:1], bench.ticks)[0, 0, 1 if own_loop(law) else 2] * bench.load
+    )
+    return w
+
+
+def _recovery_ms(error: Array, T_s: float) -> float:
+    outside = np.nonzero(error > RECOVERED_RAD_S)[0]
+    return (int(outside[-1]) + 1) * T_s * 1e3 if len(outside) else 0.0
 
 
 def margins(law: Record, bench: Bench, plant: Plant) -> dict[str, float]:
@@ -421,8 +443,11 @@ def worst_of(every: Sequence[Loop]) -> Loop:
 
 
 def judge(law: Record, bench: Bench, plants: Sequence[Plant] | None = None) -> Verdict:
-    """All measures of a law; the first plant is the nominal one."""
-    plants = bench.plants() if plants is None else plants
-    every = loops(law, bench, plants)
+    """All measures of a law; the first plant is the nominal one. On the bench's own they are on its shaft."""
+    every = loops(law, bench, bench.plants() if plants is None else plants)
+    if plants is None and bench.elastic:
+        motors = (bench.motor, *bench.corners())
+        rows = zip(motors, bench.turns(), every, strict=True)
+        every = [on_shaft(law, bench, *row) for row in rows]
     u, w = noise(law, bench)
     return Verdict(every[0], worst_of(every), u, w)

@@ -21,7 +21,17 @@ from hil.control.linalg import Array
 from hil.control.registry import complete, laws, observers
 from hil.tuning.families import Family, Tables
 from hil.tuning.loop import Plant, Record
-from hil.tuning.measure import Bench, Place, Verdict, judge, loops, noise, quiet, worst_of
+from hil.tuning.measure import (
+    Bench,
+    Place,
+    Verdict,
+    judge,
+    loops,
+    noise,
+    on_shaft,
+    quiet,
+    worst_of,
+)
 
 SLACK: Final = 0.002
 """Share by which a limit may be exceeded: below what its measure is exact to."""
@@ -111,6 +121,8 @@ class _Search:
         nominal = loops(law, self.bench, [self.nominal])[0]
         if not nominal.stable:
             return 1e5
+        if self.bench.elastic:
+            nominal = on_shaft(law, self.bench, self.bench.motor, self.bench.shafts[0], nominal)
         u, _ = noise(law, self.bench)
         first = self._over(u, nominal, nominal)
         if not math.isfinite(u) or first > 0.3:

@@ -21,4 +21,4 @@ def test_a_motor_is_found_over_the_bus_and_no_frame_is_beyond_its_limits(tmp_pat
     assert misses(row) == [], row
     assert row["off"].keys() == GOALS.keys() and max(map(abs, row["off"].values())) < 0.1
     assert 0.3 < row["peaks"]["i_max"] < 0.7 and 0.3 < row["peaks"]["w_max"] < 0.95
-    assert [step["ended"] for step in row["steps"]] == ["stop_requested"] * 4
+    assert [step["ended"] for step in row["steps"]] == ["stop_requested"] * 5

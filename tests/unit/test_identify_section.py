@@ -57,7 +57,7 @@ def test_a_run_of_identify_shows_fits_residuals_and_intervals(
     assert len(pictures) == 2 * len(found["white"])
     assert re.search(r'class="fit" d="M[\d.]+ [\d.]+[LM]', pictures[0])
     assert pictures[0].count("h0") <= SHOWN and 'class="band"' in pictures[1]
-    assert "nan" not in section and "style=" not in section  # the page's policy lets no such style be
+    assert ">nan" not in section and "style=" not in section  # the page's policy lets no such style be
 
 
 def test_the_residuals_that_are_drawn_are_those_of_the_fit(tmp_path: Path) -> None:
