@@ -249,19 +249,19 @@ def keep(table: Any) -> None:
 @jit
 def decide(nodes: Any) -> Any:
     """Each node's controller: OTHERS when those must stop with one, NEW when there is something to log."""
-    found = CALM
+    found, left, going = CALM, False, False
     for i in range(len(nodes)):
         table = places_at(nodes, i)
         ticks = array_at(table, TICK_AT, TICK)
-        state = ticks[0]["state"]
+        state, before = ticks[0]["state"], ticks[0]["reason"]
         keep(table)
         whole_at(places_at(table, LAW), ticks)
         reason = ticks[0]["reason"]
-        if reason not in (QUIET, STOPPED, ENDS):
-            found = OTHERS
-        elif reason != QUIET or ticks[0]["state"] != state or ticks[0]["rx_flags"] & TROUBLE != 0:
-            found = max(found, NEW)
-    return found
+        left |= reason not in (QUIET, STOPPED, ENDS)
+        going |= reason == QUIET
+        if reason != before or ticks[0]["state"] != state or ticks[0]["rx_flags"] & TROUBLE != 0:
+            found = NEW
+    return OTHERS if left and going else found
 
 
 @jit

@@ -8,8 +8,10 @@ from typing import Any
 
 import pytest
 
+from hil.log.reader import open_log
+from hil.replay import replay_log
 from hil.runtime.fused import PHASES
-from tests.vm.guest.instructions import BUSES
+from tests.vm.guest.instructions import BUSES, DRIVES
 from tests.vm.instructions import apart, budget, excess, read, table_of, total_of
 
 pytestmark = [pytest.mark.vm, pytest.mark.timeout(1800)]
@@ -29,7 +31,7 @@ def of_bus(counted: dict[str, Any], name: str) -> Any:
     return counted["buses"][name]
 
 
-@pytest.mark.parametrize("name", BUSES)
+@pytest.mark.parametrize("name", [*BUSES, *DRIVES])
 def test_a_tick_is_within_its_budget(
     counted: dict[str, Any], name: str, figure: Callable[[str], None]
 ) -> None:
@@ -38,7 +40,7 @@ def test_a_tick_is_within_its_budget(
     assert not (over := excess(name, bus)), over
 
 
-@pytest.mark.parametrize("name", BUSES)
+@pytest.mark.parametrize("name", [*BUSES, *DRIVES])
 def test_two_runs_of_a_boot_cost_the_same(counted: dict[str, Any], name: str) -> None:
     """What makes the budget's 3 percent a bound and not noise."""
     bus = of_bus(counted, name)
@@ -53,3 +55,22 @@ def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str
     sleeps = set() if name == "kernel" else {"sleep"}  # there the loop waits for feedback alone
     assert {phase for phase, count in bus["phases"].items() if count > 0} == set(PHASES) - {"sleep"} | sleeps
     assert sum(bus["phases"].values()) == pytest.approx(total_of(bus), rel=0.2), bus
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_a_shipped_drive_is_kept_up_with(counted: dict[str, Any], socketcan: Path, name: str) -> None:
+    """No period is skipped, the log replays to the bit, and a tick of one drive stays under 50,000."""
+    bus = of_bus(counted, name)
+    for said in bus["said"]:
+        assert (said["skipped"], said["dropped"], said["ended"]) == (0, 0, "stop_requested"), said
+    log = open_log(socketcan / f"{name}.mcap")
+    assert len(log.ticks) >= 500 and replay_log(log).verdict == "same"
+    assert name == "dyno" or total_of(bus) < 50_000
+
+
+def test_two_nodes_cost_less_than_one_and_a_half(
+    counted: dict[str, Any], figure: Callable[[str], None]
+) -> None:
+    one, two = (total_of(of_bus(counted, name)) for name in ("cia402", "dyno"))
+    figure(f"two nodes: {two / one:.2f} x the instructions of one, {one:.0f}")
+    assert two < 1.5 * one

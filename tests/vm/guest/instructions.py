@@ -3,15 +3,19 @@
 For each bus: three plain runs of `hil run`, two with the meter of `hil bench` around the phases, and the bare
 loop against the same drive as the floor. A stall of the machine only adds, so the lowest counts. The thread's
 processor time is read, so that waiting counts for nothing. Leaves $OUT/instructions.json.
+
+For each shipped drive: two plain runs of its configuration, with the last one's log.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +36,24 @@ BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
     "fd": ("vcan0", "vcan0", FD, ('dbc="../drives/hil_pmsm_fd.dbc"',)),
 }
 """kernel: SYNC by the kernel's timer, for the loop and for the bare loop."""
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """A shipped configuration; ``nodes``: settings for each node that hil configure sets up first."""
+
+    nodes: tuple[tuple[str, ...], ...] = ()
+    settings: tuple[str, ...] = ()
+
+
+DRIVES: dict[str, Shipped] = {  # configs/NAME.toml
+    "current": Shipped(),
+    "cia402": Shipped(((),)),
+    "moteus": Shipped(),
+    "odrive": Shipped(),
+    # each motor turns by itself: both on one shaft are emulated in Python, too slow in virtual time
+    "dyno": Shipped((("node=motor",), ("node=load",)), ("motor.J_kg_m2=0.011",)),
+}
 CALM = ("load=[]", "truth=false")
 
 
@@ -57,23 +79,33 @@ def run_bare(interface: str, dbc: Path, ticks: int, priority: int, by_kernel: bo
 
 
 class Bus:
-    """One bus of :data:`BUSES` with an emulated drive on it."""
+    """One bus of :data:`BUSES` with an emulated drive on it, or one with the drives of :data:`DRIVES`."""
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        self.own, self.drive, self.settings, plant = BUSES[name]
+        self.name, self.config, calm, nodes = name, CONFIG, CALM, ((),)
+        if name in DRIVES:
+            self.own, self.drive, self.settings, plant = "vcan0", "vcan0", DRIVES[name].settings, ()
+            self.config, calm, nodes = f"configs/{name}.toml", (), DRIVES[name].nodes or ((),)
+        else:
+            self.own, self.drive, self.settings, plant = BUSES[name]
         self.folder = SCRATCH / f"instructions-{name}"
         self.folder.mkdir()
-        words = ("emulate", CONFIG, *self.words(self.drive), *flags("--plant-set", *CALM, *plant))
-        self.emulator = Forked.hil(self.folder / "emulator.txt", *words)
+        more = flags("--plant-set", *calm, *plant)
+        self.emulators = [
+            Forked.hil(
+                self.folder / f"emulator-{i}.txt",
+                "emulate", self.config, *self.words(self.drive, *settings), *more,
+            )
+            for i, settings in enumerate(nodes)
+        ]  # fmt: skip
 
-    def words(self, interface: str) -> list[str]:
-        return ["-i", "socketcan", "-c", interface, *flags("--set", *self.settings)]
+    def words(self, interface: str, *settings: str) -> list[str]:
+        return ["-i", "socketcan", "-c", interface, *flags("--set", *self.settings, *settings)]
 
     def run_words(self) -> list[str]:
         arm = [] if self.own.startswith("vcan") else ["--arm", "--yes"]
         more = (f'log.folder="{self.folder}"', f"loop.duration_s={SECONDS}")
-        return ["run", CONFIG, *self.words(self.own), "--json", *arm, *flags("--set", *more)]
+        return ["run", self.config, *self.words(self.own, *more), "--json", *arm]
 
     def result(self, job: Callable[[], int], name: str) -> str:
         """What a process of its own printed, once it went to its end."""
@@ -84,9 +116,19 @@ class Bus:
             sys.stderr.write(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}\n")
         raise RuntimeError(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}")
 
+    def run(self, name: str) -> dict[str, Any]:
+        """What a plain run says of itself."""
+        said: dict[str, Any] = json.loads(self.result(lambda: cli.main(self.run_words()), name))
+        return said
+
     def plain(self, name: str) -> float:
-        said = json.loads(self.result(lambda: cli.main(self.run_words()), name))
-        return float(said["processor_us"]) * 1e3
+        return float(self.run(name)["processor_us"]) * 1e3
+
+    def configured(self) -> None:
+        """Set up what has forgotten its mapping while it was off."""
+        for number, settings in enumerate(DRIVES[self.name].nodes):
+            words = ["configure", self.config, *self.words(self.own, *settings), "--json"]
+            self.result(lambda words=words: cli.main(words), f"configured-{number}")  # type: ignore[misc]
 
     def phases(self) -> dict[str, float]:
         report = self.folder / "phases.json"
@@ -105,15 +147,34 @@ class Bus:
 
         return float(self.result(job, "bare"))
 
+    def until_ready(self) -> None:
+        for emulator in self.emulators:
+            emulator.until("ready")
+
+    def end(self) -> None:
+        for emulator in self.emulators:
+            emulator.send_signal(signal.SIGTERM)
+            emulator.wait()
+
     def measure(self) -> dict[str, Any]:
-        self.emulator.until("ready")
+        self.until_ready()
         try:
             runs = [self.plain(name) for name in ("first", "second", "third")]
             phases = min((self.phases() for _ in range(2)), key=lambda found: sum(found.values()))
             return {"runs": sorted(runs), "phases": phases, "bare": self.bare()}
         finally:
-            self.emulator.send_signal(signal.SIGTERM)
-            self.emulator.wait()
+            self.end()
+
+    def measure_drive(self, out: Path) -> dict[str, Any]:
+        """Of :data:`DRIVES`."""
+        self.until_ready()
+        try:
+            self.configured()
+            said = [self.run(name) for name in ("first", "second")]
+            shutil.copy(said[-1]["log"], out / f"{self.name}.mcap")
+            return {"runs": sorted(float(one["processor_us"]) * 1e3 for one in said), "said": said}
+        finally:
+            self.end()
 
 
 def measure(out: Path) -> None:
@@ -125,3 +186,6 @@ def measure(out: Path) -> None:
         if Path(f"/sys/class/net/{own}").exists():
             found["buses"][name] = Bus(name).measure()
             (out / "instructions.json").write_text(json.dumps(found))
+    for name in DRIVES:
+        found["buses"][name] = Bus(name).measure_drive(out)
+        (out / "instructions.json").write_text(json.dumps(found))

@@ -15,6 +15,7 @@ from hil.sim.emulate import make_node
 
 SCRATCH = Path(os.environ.get("TMPDIR", "/dev/shm"))
 CONFIG = "configs/vcan0.toml"
+SHIPPED = ("current", "cia402", "moteus", "odrive")
 FD = ("bus.fd=true", 'drive.dbc="drives/hil_pmsm_fd.dbc"')
 KERNEL = ('bus.sync="kernel"',)
 
@@ -74,6 +75,7 @@ class Forked:
 
 def warm_up() -> None:
     """Import what a run needs and load its compiled kernels once, before any process is forked."""
+    from hil.runtime import fusednodes
     from hil.runtime.session import compile_kernels
     from hil.runtime.setup import Overrides, load_setup
 
@@ -83,15 +85,24 @@ def warm_up() -> None:
     node[1].close()
     compile_kernels(setup)
     compile_kernels(load_setup(Path(CONFIG), Overrides(settings=('bus.sync="kernel"',))))
+    fusednodes.load()
     read_in()
 
 
 def compile_the_rest() -> None:
     """On the host: kernels that single jobs need, so that the machine finds them compiled."""
     from hil.bench.pieces import guard_ns
+    from hil.runtime.session import compile_kernels
     from hil.runtime.setup import Overrides, load_setup
 
     guard_ns(load_setup(Path(CONFIG), Overrides()).machine, 1)
+    own_bus = ['bus.interface="hil-local"']
+    for name in SHIPPED:
+        path = Path(f"configs/{name}.toml")
+        compile_kernels(load_setup(path, Overrides()))
+        node, link, _ = make_node(path, load_toml(path, RunConfig, own_bus), [])
+        node.warm_up()
+        link.close()
 
 
 def read_in() -> None:
