@@ -59,18 +59,10 @@ def test_every_phase_was_seen_and_they_add_up(counted: dict[str, Any], name: str
 
 @pytest.mark.parametrize("name", DRIVES)
 def test_a_shipped_drive_is_kept_up_with(counted: dict[str, Any], socketcan: Path, name: str) -> None:
-    """No period is skipped, the log replays to the bit, and a tick of one drive stays under 50,000."""
+    """No period is skipped, the log replays to the bit, and a tick stays under 50,000."""
     bus = of_bus(counted, name)
-    for said in bus["said"]:
-        assert (said["skipped"], said["dropped"], said["ended"]) == (0, 0, "stop_requested"), said
+    said = bus["said"]
+    assert (said["skipped"], said["dropped"], said["ended"]) == (0, 0, "stop_requested"), said
     log = open_log(socketcan / f"{name}.mcap")
     assert len(log.ticks) >= 500 and replay_log(log).verdict == "same"
-    assert name == "dyno" or total_of(bus) < 50_000
-
-
-def test_two_nodes_cost_less_than_one_and_a_half(
-    counted: dict[str, Any], figure: Callable[[str], None]
-) -> None:
-    one, two = (total_of(of_bus(counted, name)) for name in ("cia402", "dyno"))
-    figure(f"two nodes: {two / one:.2f} x the instructions of one, {one:.0f}")
-    assert two < 1.5 * one
+    assert total_of(bus) < 50_000

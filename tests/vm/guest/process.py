@@ -75,7 +75,7 @@ class Forked:
 
 def warm_up() -> None:
     """Import what a run needs and load its compiled kernels once, before any process is forked."""
-    from hil.runtime import fusednodes
+
     from hil.runtime.session import compile_kernels
     from hil.runtime.setup import Overrides, load_setup
 
@@ -85,7 +85,6 @@ def warm_up() -> None:
     node[1].close()
     compile_kernels(setup)
     compile_kernels(load_setup(Path(CONFIG), Overrides(settings=('bus.sync="kernel"',))))
-    fusednodes.load()
     read_in()
 
 
