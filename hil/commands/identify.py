@@ -35,7 +35,9 @@ def register(commands: Commands) -> None:
     command.add_argument("config", type=Path, metavar="CONFIG", nargs="?", help="run configuration (TOML)")
     command.add_argument("--emulated", action="store_true", help="start the emulated drive of CONFIG, too")
     command.add_argument(
-        "--steps", metavar="A,B", help="of sensors, standstill, spinning, inertia (all); cogging by itself"
+        "--steps",
+        metavar="A,B",
+        help="of sensors, standstill, spinning, inertia, shaft (all); cogging by itself",
     )
     command.add_argument(
         "--from",
