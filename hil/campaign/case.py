@@ -22,7 +22,9 @@ from firmware_model.config import PlantConfig, Wire
 from firmware_model.node import wire_of
 from hil.campaign.figures import KEYS, Judged
 from hil.campaign.margins import design_margins
+from hil.campaign.onbus import judged_on_the_bus
 from hil.campaign.plan import PLANT, Builder, Plan, PlanTable, Settings
+from hil.campaign.values import toml
 from hil.config.tables import RunConfig, validate
 from hil.config.toml import override, put, read_toml
 from hil.control.errors import ControlDesignError
@@ -54,7 +56,7 @@ class Stand:
         self._config = _opened(read_toml(path), path.parent)
         for text in table.settings:
             override(self._config, text, path.parent)
-        self._plant_set = table.plant_set
+        self._config_set, self._plant_set = table.settings, table.plant_set
         self._plants = lru_cache(maxsize=16)(self._read_plant)
         self._databases = lru_cache(maxsize=16)(Database)
         self._wires = lru_cache(maxsize=16)(lambda dbc, node, kind: wire_of(self._databases(dbc, node), kind))
@@ -122,15 +124,41 @@ class Stand:
         plant = validate(data, PlantConfig, "plant", folder)
         return plant, self._wires(folder / plant.dbc, plant.node_id, plant.protocol)
 
-    def simulation(self, settings: Settings, seed: int | None = None) -> tuple[Setup, Simulation]:
+    def parts(self, settings: Settings, seed: int | None = None) -> tuple[Setup, PlantConfig, Wire]:
         """Controller and plant of some settings. Raises HilError, DriverError, ControlDesignError."""
         own = {key: value for key, value in settings.items() if not key.startswith(PLANT)}
         plant_settings = {
             key[len(PLANT) :]: value for key, value in settings.items() if key.startswith(PLANT)
         }
         setup = self._setup(own)
-        plant, wire = self._plant(setup, plant_settings, seed)
+        return (setup, *self._plant(setup, plant_settings, seed))
+
+    def simulation(self, settings: Settings, seed: int | None = None) -> tuple[Setup, Simulation]:
+        """:meth:`parts`, ready to run. Raises what they do, and for a plant that needs the bus."""
+        setup, plant, wire = self.parts(settings, seed)
         return setup, simulation_of(setup, plant, wire)
+
+    def check(self, settings: Settings) -> None:
+        """Raise what :meth:`run` would refuse the settings for."""
+        setup, plant, wire = self.parts(settings)
+        if not plant.fault:
+            simulation_of(setup, plant, wire)
+
+    def on_bus(self, case: int) -> bool:
+        """True for a case with a fault script; what can't be is no such case."""
+        try:
+            return bool(self.parts(self.plan.settings(case))[1].fault)
+        except REFUSALS:
+            return False
+
+    def texts(self, settings: Settings, seed: int | None) -> tuple[list[str], list[str]]:
+        """What sets a case of the configuration and of the plant, as KEY=VALUE."""
+        own, plant = list(self._config_set), list(self._plant_set)
+        seeded = {} if seed is None else {f"{PLANT}seed": seed}
+        for key, value in (self.plan.fixed | seeded | settings).items():
+            place, name = (plant, key[len(PLANT) :]) if key.startswith(PLANT) else (own, key)
+            place.append(f"{name}={toml(value)}")
+        return own, plant
 
     @contextlib.contextmanager
     def _room(self) -> Iterator[Columns]:
@@ -155,9 +183,11 @@ class Stand:
         }
         row |= settings
         try:
-            setup, simulation = self.simulation(settings, seed)
+            setup, plant, wire = self.parts(settings, seed)
             with self._room() as room:
-                return row | judged(setup, simulation, room)
+                if plant.fault:
+                    return row | judged_on_the_bus(setup, *self.texts(settings, seed), room)
+                return row | judged(setup, simulation_of(setup, plant, wire), room)
         except REFUSALS as error:
             return row | {"ended": "refused", "passed": False, "why": self._said(error)}
         except Exception as error:  # noqa: BLE001 - one case that breaks is a row, not the end of the campaign
@@ -296,7 +326,7 @@ def _named(value: Any, base: Path) -> list[Path]:
 
 def refuse_unknown(stand: Stand, where: str) -> None:
     """Refuse a plan whose base, or a key of it, can't be set at all. Raises HilError."""
-    stand.simulation({}, None)
+    stand.check({})
     problems, bases = [], [settings for _, settings in stand.plan.variants] or [{}]
     for key, values in stand.plan.listed().items():
         found = [_why_in_all(stand, bases, {key: value}) for value in values]
@@ -328,7 +358,7 @@ def _why_in_all(stand: Stand, bases: list[Settings], settings: Settings) -> str 
 def _why(stand: Stand, settings: Settings) -> str | None:
     """Why settings can't be; None when they can."""
     try:
-        stand.simulation(settings, None)
+        stand.check(settings)
     except REFUSALS as error:
         return first_line(error)
     return None

@@ -15,8 +15,9 @@ from hil.campaign.case import CaseJob, Stand, job_of
 from hil.campaign.engine import Rate, Workers
 from hil.campaign.figures import KEYS
 from hil.campaign.margins import design_margins
+from hil.campaign.onbus import CASE_S
 from hil.campaign.page import page
-from hil.campaign.plan import PlanTable, read_plan
+from hil.campaign.plan import PLANT, PlanTable, read_plan
 from hil.campaign.store import Folder, Schema, kind_of
 from hil.errors import HilError
 from hil.log.outputs import output_file
@@ -28,6 +29,8 @@ ALONE_TICKS: Final = 400_000
 """A campaign of fewer ticks is done sooner in this process than workers are started."""
 PAGE: Final = "report.html"
 TICK_S: Final = 0.85e-6
+FIRSTS: Final = 64
+"""Cases that are looked at to see how many go over the bus."""
 START_S: Final = 4.0
 """Imports, start of the workers and report."""
 ROW_BYTES: Final = 130
@@ -100,6 +103,13 @@ def ticks_of(stand: Stand) -> int:
     )
 
 
+def work_of(stand: Stand) -> int:
+    """What a case costs, in ticks of a simulation: of the first ones, some may go over the bus."""
+    firsts = min(stand.plan.count, FIRSTS)
+    on_bus = sum(map(stand.on_bus, range(firsts))) if f"{PLANT}fault" in stand.plan.keys else 0
+    return ticks_of(stand) + round(on_bus / max(1, firsts) * CASE_S / TICK_S)
+
+
 def batch_size(ticks: int, count: int, workers: int) -> int:
     """Cases of a batch: half a second of work, and for few cases enough batches for all.
 
@@ -114,7 +124,7 @@ def where(stand: Stand, workers: int | None, scheduler: str | None) -> Workers:
     """Where it runs, unless it was said: small campaigns in this process."""
     if scheduler is not None:
         return Workers(workers or engine.cores(), scheduler)
-    small = ticks_of(stand) * stand.plan.count <= ALONE_TICKS
+    small = work_of(stand) * stand.plan.count <= ALONE_TICKS
     return Workers((0 if small else engine.cores()) if workers is None else workers)
 
 
@@ -123,7 +133,7 @@ def dry_run(plan: Path, workers: int | None = None) -> dict[str, Any]:
     _, stand = job_of(plan, read_plan(plan))
     used = where(stand, workers, None).count
     ticks = ticks_of(stand)
-    seconds = stand.plan.count * (ticks * TICK_S + 1e-3) / max(1, used) + (START_S if used else 0.0)
+    seconds = stand.plan.count * (work_of(stand) * TICK_S + 1e-3) / max(1, used) + (START_S if used else 0.0)
     return {
         "cases": stand.plan.count,
         "ticks_a_case": ticks,
@@ -167,7 +177,7 @@ def campaign(
     used = where(stand, workers, scheduler)
     if used.count or used.scheduler:
         warm(stand)
-    return finish(job, held, used, batch_size(ticks_of(stand), stand.plan.count, used.count), seen)
+    return finish(job, held, used, batch_size(work_of(stand), stand.plan.count, used.count), seen)
 
 
 def warm(stand: Stand) -> None:

@@ -127,12 +127,17 @@ def own_channel(what: str) -> str:
     return f"{what}-{os.getpid()}-{uuid.uuid4().hex[:6]}"
 
 
-def closed_loop(path: Path, overrides: Overrides) -> tuple[Setup, RunResult, Log]:
-    """Emulator as a process, controller here, on a bus of their own; the log is read back."""
+def closed_loop(
+    path: Path, overrides: Overrides, plant: tuple[str, ...] = ()
+) -> tuple[Setup, RunResult, Log]:
+    """Emulator as a process, controller here, on a bus of their own; the log is read back.
+
+    ``plant``: settings of the plant, KEY=VALUE.
+    """
     if overrides.channel is None:
         overrides = replace(overrides, channel=own_channel("demo"))
     setup = load_setup(path, overrides)
-    with emulator_process(path, overrides):
+    with emulator_process(path, overrides, plant):
         if setup.config.canopen is not None:
             set_up(path, setup.config)
         result = run(setup)

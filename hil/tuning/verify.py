@@ -14,10 +14,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.log.reader import open_log
-from hil.runtime.session import run
 from hil.runtime.setup import Overrides, Setup, load_setup
-from hil.sim.demo import emulator_process, own_channel
+from hil.sim.demo import closed_loop, own_channel
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import Seen, bench_of, coupled, plant_settings, seen_in
 from hil.tuning.families import Tables, settings_of
@@ -43,9 +41,7 @@ def on_the_bus(path: Path, overrides: Overrides, plant: list[str]) -> Any:
     """The ticks of a lockstep run with the emulator as a process."""
     lockstep = (*overrides.settings, 'loop.clock="lockstep"')
     overrides = replace(overrides, channel=own_channel("verify"), settings=lockstep)
-    with emulator_process(path, overrides, tuple(plant)):
-        result = run(load_setup(path, overrides))
-    return open_log(Path(result.log)).ticks
+    return closed_loop(path, overrides, tuple(plant))[2].ticks
 
 
 def verify(

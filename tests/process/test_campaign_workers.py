@@ -22,7 +22,10 @@ import pytest
 import hil
 from hil.campaign import store
 from hil.campaign.engine import run_batch
+from hil.campaign.figures import KEYS
 from hil.campaign.identity import identity, source
+from hil.campaign.onbus import CASE_S
+from hil.campaign.run import dry_run, one_case
 from hil.errors import HilError
 from tests.conftest import CONFIGS, ROOT
 
@@ -189,3 +192,38 @@ def test_a_worker_of_another_version_is_refused_by_name_and_an_equal_one_taken(t
 def test_a_worker_of_another_version_that_comes_later_runs_nothing() -> None:
     with pytest.raises(HilError, match=r"a worker has numpy .* and not 0; install the same on all"):
         run_batch(None, {**identity(), "numpy": "0"}, 0, 1)  # type: ignore[arg-type]
+
+
+@pytest.mark.beside
+def test_a_fault_script_is_an_axis(tmp_path: Path) -> None:
+    """Those cases go over the bus in lockstep; a fault that never comes leaves a simulation's figures."""
+    path = tmp_path / "plan.toml"
+    path.write_text(
+        f"""config = "{CONFIGS / "demo.toml"}"
+set = ["loop.duration_s=0.6", "reference.at_s=0.05"]
+plant_set = ["load.0.at_s=0.3"]
+[grid]
+"plant:fault" = [
+    [],
+    [{{ kind = "drop", at_s = 60.0, message = "FEEDBACK" }}],
+    [{{ kind = "drop", at_s = 0.4, message = "FEEDBACK" }}],
+    [{{ kind = "drop", at_s = 0.4, message = "FEEDBAK" }}],
+]
+""",
+        encoding="utf-8",
+    )
+    result = hil.campaign(path, tmp_path / "out", workers=2)
+    simulated, never, dropped, misspelt = result.rows()
+    assert simulated["ended"] == never["ended"] == "stop_requested"
+    assert dropped["ended"] == "stale_feedback"
+    assert dropped["why"].startswith("no fresh feedback: 61 ms, limit feedback.hold_ticks = 60 ms")
+    assert misspelt["ended"] == "refused"
+    assert misspelt["why"].startswith("plants/../drives/hil_pmsm.dbc: has no message FEEDBAK; it has COMMAND")
+    figures = [name for name in KEYS if simulated[name] == simulated[name]]
+    assert {name: never[name] for name in figures} == pytest.approx({n: simulated[n] for n in figures})
+    assert len(figures) > 10
+    alone = one_case(path, 2)
+    assert {name: alone[name] for name in figures if alone[name] is not None} == {
+        name: dropped[name] for name in figures if alone[name] is not None
+    }
+    assert dry_run(path, 2)["seconds"] > 4 * 0.5 * CASE_S / 2

@@ -375,12 +375,9 @@ current_integral_v_as = 674.0
 
 def test_why_a_case_is_refused_names_no_folder_of_a_worker(tmp_path: Path) -> None:
     """A row is the same wherever it was run: alone in place, or by a worker from its copies."""
-    text = """[grid]
-"plant:fault" = [[], [{ kind = "load", at_s = 0.1, torque_n_m = 1.0 }]]
-"""
-    path = plan_file(tmp_path, text)
+    path = plan_file(tmp_path, '[grid]\n"emulator.plant" = ["plants/demo.toml", "plants/none.toml"]\n')
     (_, refused) = hil.campaign(path, tmp_path / "out").rows()
-    assert refused["why"] == "demo.toml: fault: a fault script needs the bus; use hil run or hil faults"
+    assert refused["why"] == "plants/none.toml: can't be read: No such file or directory"
     assert one_case(path, 1)["why"] == refused["why"]
 
 
