@@ -10,6 +10,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,6 +20,7 @@ from hil.campaign.figures import KEYS, NAMES
 from hil.campaign.plan import PLANT, bundle
 from hil.campaign.store import INPUTS, Folder
 from hil.campaign.values import toml
+from hil.config.toml import read_toml
 
 F8 = npt.NDArray[np.float64]
 Z95: Final = 1.959963984540054
@@ -152,10 +154,21 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+def _on_bus(path: Path, plant: list[str]) -> bool:
+    """True for a case with a fault script, as its settings or its plant's file have it."""
+    given = [text for text in plant if text.partition("=")[0] == "fault"]
+    if given:
+        return given[-1] != "fault=[]"
+    named = read_toml(path).get("emulator", {}).get("plant")
+    return bool(named and read_toml(path.parent / named).get("fault"))
+
+
 def command(held: Folder, row: dict[str, Any]) -> str:
     """The command that runs a case again, with a log."""
     own, plant = settings_of(held, row)
-    words = ["hil", "simulate", str(held.path / INPUTS / held.about["config"])]
+    path = held.path / INPUTS / held.about["config"]
+    what = ["demo", str(path), "--lockstep"] if _on_bus(path, plant) else ["simulate", str(path)]
+    words = ["hil", *what]
     words += [word for text in own for word in ("--set", text)]
     words += [word for text in plant for word in ("--plant-set", text)]
     return shlex.join(words)

@@ -14,6 +14,9 @@ def register(commands: Commands) -> None:
         "demo", cmd_demo, "Start the emulator, close the loop, step the load, replay, show what happened."
     )
     command.add_argument("config", nargs="?", type=Path, help="configuration (default: configs/demo.toml)")
+    command.add_argument(
+        "--plant-set", action="append", default=[], metavar="KEY=VALUE", help="override a plant key"
+    )
     bus_flags(command)
     command.add_argument("--lockstep", action="store_true", help="no real time: reproducible to the bit")
 
@@ -24,7 +27,7 @@ def cmd_demo(args: argparse.Namespace) -> int:
     from hil.sim.demo import demo
 
     say("demo: emulated drive, closed loop at 1 kHz, load step, replay; about ten seconds")
-    result = demo(args.config, overrides(args))
+    result = demo(args.config, overrides(args), tuple(args.plant_set))
     if args.json:
         print_json(result)
     else:

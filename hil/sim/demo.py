@@ -200,16 +200,23 @@ def demo_nodes(path: Path, overrides: Overrides) -> dict[str, Any]:
     return shown | {"clock": setup.config.loop.clock, "too_slow": slow, "nodes": result.nodes}
 
 
-def demo(path: Path | None, overrides: Overrides) -> dict[str, Any]:
-    """Run the demo, in lockstep where the host can't hold its rate; raises HilError with one clear line."""
+def demo(path: Path | None, overrides: Overrides, plant: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Run the demo, in lockstep where the host can't hold its rate; raises HilError with one clear line.
+
+    ``plant``: settings of the plant, KEY=VALUE.
+    """
     path = path or find_config("demo.toml")
     if load_nodes(path, overrides.as_settings()):
+        if plant:
+            raise HilError(
+                f"{path}: --plant-set: each of several nodes has its own plant; change that file"
+            )
         return demo_nodes(path, overrides)
-    setup, result, log = closed_loop(path, overrides)
+    setup, result, log = closed_loop(path, overrides, plant)
     slow = too_slow(setup, result, log) if setup.binding.opener else ""
     if slow:
         say(f"{slow}; going on in lockstep: the same loop and drive, without real time")
-        setup, result, log = closed_loop(path, in_lockstep(overrides, setup))
-    plant, _ = load_plant(path, setup.config)
-    shown = summary(setup, log.ticks, result, replay_log(log), true_motor(plant.motor))
+        setup, result, log = closed_loop(path, in_lockstep(overrides, setup), plant)
+    motor = load_plant(path, setup.config, list(plant))[0].motor
+    shown = summary(setup, log.ticks, result, replay_log(log), true_motor(motor))
     return shown | {"clock": setup.config.loop.clock, "too_slow": slow}

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -20,7 +21,7 @@ import psutil
 import pytest
 
 import hil
-from hil.campaign import store
+from hil.campaign import store, summary
 from hil.campaign.engine import run_batch
 from hil.campaign.figures import KEYS
 from hil.campaign.identity import identity, source
@@ -227,3 +228,10 @@ plant_set = ["load.0.at_s=0.3"]
         name: dropped[name] for name in figures if alone[name] is not None
     }
     assert dry_run(path, 2)["seconds"] > 4 * 0.5 * CASE_S / 2
+    again = shlex.split(summary.command(result.folder, dropped))
+    shown = subprocess.run(
+        [sys.executable, "-m", "hil.cli", *again[1:], "--set", f'log.folder="{tmp_path}"', "--json"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert json.loads(shown.stdout)["end"]["text"] == dropped["why"]
+    assert again[1] == "demo" and summary.command(result.folder, simulated).startswith("hil simulate ")
