@@ -208,9 +208,7 @@ def demo(path: Path | None, overrides: Overrides, plant: tuple[str, ...] = ()) -
     path = path or find_config("demo.toml")
     if load_nodes(path, overrides.as_settings()):
         if plant:
-            raise HilError(
-                f"{path}: --plant-set: each of several nodes has its own plant; change that file"
-            )
+            raise HilError(f"{path}: --plant-set: each of several nodes has its own plant; change that file")
         return demo_nodes(path, overrides)
     setup, result, log = closed_loop(path, overrides, plant)
     slow = too_slow(setup, result, log) if setup.binding.opener else ""

@@ -79,3 +79,16 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.strip() == left
+
+
+@pytest.mark.parametrize(("wanted", "done"), [(True, ["locked", "in place"]), (False, [])])
+def test_the_guardians_memory_stays_where_it_is_wanted(
+    wanted: bool, done: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found: list[str] = []
+    monkeypatch.setattr(realtime, "lock_as_touched", lambda: found.append("locked"))
+    monkeypatch.setattr(realtime, "keep_pages", lambda: found.append("in place"))
+    for name in ("disable", "freeze"):
+        monkeypatch.setattr(gc, name, lambda: None)
+    Rights(priority=0, lock_memory=wanted).acquire()
+    assert found == done
