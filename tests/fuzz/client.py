@@ -80,7 +80,7 @@ class RawLink(SocketLink):
             self._far.send(raw)
 
     def close(self) -> None:
-        for one in (self._far, self._drain, self.receiving, self._sending):
+        for one in (self._far, self._drain, self.receiving, self.sending):
             one.close()
 
 
