@@ -71,6 +71,7 @@ NUMBERS: Final = (
     "seed",
     "damping",
     "damping_ratio",
+    "resonance_damping",
     "inertia_ratio",
     "share",
     "voltage_share",
