@@ -26,6 +26,8 @@ if worker := os.environ.get("PYTEST_XDIST_WORKER"):  # no list of runs is anothe
     os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix=f"hil-{worker}-")
 
 
+FIGURE = "figure"
+"""Property of a test: a line that is shown at the end."""
 MACHINE = "tests/vm/"
 """Its tests share one boot of the bench machine: one worker's, and the longest job of all."""
 
@@ -46,6 +48,15 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadSco
             return MACHINE if nodeid.startswith(MACHINE) else nodeid.split("::", 1)[0]
 
     return Files(config, log)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Show the figures of the runs on SocketCAN, whichever process ran them."""
+    reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
+    lines = [line for one in reports for name, line in one.user_properties if name == FIGURE]
+    if lines:
+        terminalreporter.section("SocketCAN")
+        terminalreporter.write_line("\n".join(lines))
 
 
 def pytest_unconfigure() -> None:

@@ -61,7 +61,7 @@ def test_only_the_loop_asks_the_drive_to_send() -> None:
 
 
 def test_only_the_client_and_the_compiled_ticks_call_the_kernels_that_send() -> None:
-    """These send what the guard has judged in the same call: tests/contract/test_fused.py and its neighbour."""
+    """These send what the guard has judged in the same call: tests/contract/test_fused*.py."""
     callers = set()
     for path in [*(ROOT / "hil").rglob("*.py"), *(ROOT / "drivers").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text())):

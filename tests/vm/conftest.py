@@ -10,25 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import FIGURE
 from tests.vm.machine import ROOT, MachineError, run_in_machine
 
 REQUIRED = os.environ.get("HIL_REQUIRE_VM") == "1"
-FIGURE = "figure"
 
 
 @pytest.fixture
 def figure(record_property: Callable[[str, object], None]) -> Callable[[str], None]:
     """Takes a line that is shown at the end, also when all is well."""
     return lambda line: record_property(FIGURE, line)
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Show the figures of the runs on SocketCAN, whichever process ran them."""
-    reports = [*terminalreporter.getreports("passed"), *terminalreporter.getreports("failed")]
-    lines = [line for one in reports for name, line in one.user_properties if name == FIGURE]
-    if lines:
-        terminalreporter.section("SocketCAN")
-        terminalreporter.write_line("\n".join(lines))
 
 
 @pytest.hookimpl(tryfirst=True)
