@@ -156,6 +156,18 @@ def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array) -> tuple[
 
 
 @jit
+def move(A: Array, B: Array, u_q: float, u_d: float, rest: float, x: Array, new: Array) -> None:
+    """x+ = A x + B (u_q, u_d, rest), in place; ``new`` (n,) is room for it."""
+    n = len(x)
+    for r in range(n):
+        total = B[r, 0] * u_q + B[r, 1] * u_d + B[r, 2] * rest
+        for c in range(n):
+            total += A[r, c] * x[c]
+        new[r] = total
+    x[:] = new
+
+
+@jit
 def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool, out: Array) -> None:
     """u_q, dw and i_d after pulses on w, i_q, i_d, u_q, u_d, one after the other; ``out`` (5, 3, K) per unit.
 
@@ -187,12 +199,7 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool,
                 out[kind, 1, at] = (x[0] - out[kind, 1, at]) / SMALL[kind]
                 out[kind, 2, at] = (x[n - 1] - out[kind, 2, at]) / SMALL[kind]
             q, d = u_q + pulse * (kind == 3), u_d + pulse * (kind == 4)
-            for r in range(n):
-                total = B[r, 0] * q + B[r, 1] * d + B[r, 2]
-                for c in range(n):
-                    total += A[r, c] * x[c]
-                new[r] = total
-            x[:] = new
+            move(A, B, q, d, 1.0, x, new)
             u_q, u_d = s["u"][1], s["u"][2]
 
 
@@ -217,12 +224,7 @@ def vibrate(p: Any, s: Any, A: Array, B: Array, w: float, emf: float, out: Array
         observe(p, s, w + x[0], x[1], x[n - 1], True, 1)
         apply(s, 0.0, u_q, u_d)
         command(p, s, w, 0.0, 0.0, NO_LIMIT)
-        for r in range(n):
-            total = B[r, 0] * (u_q - emf) + B[r, 1] * u_d
-            for c in range(n):
-                total += A[r, c] * x[c]
-            new[r] = total
-        x[:] = new
+        move(A, B, u_q - emf, u_d, 0.0, x, new)
         u_q, u_d = s["u"][1], s["u"][2]
 
 
