@@ -1,4 +1,4 @@
-"""Frames by a DBC file: cantools parses it, this module compiles each message once, at start.
+"""Frames by a DBC file: cantools parses it, this module makes a message of each once it is asked for.
 
 A frame is applied whole or not at all; a value that does not fit raises.
 """
@@ -9,13 +9,13 @@ import contextlib
 import copy
 import logging
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
-from drivers.compiled import Reader, Writer, make_protection, make_reader, make_writer
 from drivers.dbc import Block, Parsed, Statements, parse, read_text
+from drivers.e2e import crc_of
 from drivers.errors import DatabaseError, DecodeError, EncodeError
 from drivers.local import EFF_FLAG
 from drivers.node import NodeRule
@@ -26,8 +26,8 @@ FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
 CRC_BYTES: Final = {0: 0, 2: 1, 5: 2}
 """Bytes at the begin of a frame that its E2E profile fills in."""
 logging.getLogger("cantools").setLevel(logging.ERROR)  # what it warns of (messages twice) is refused here
-_WRITERS_KEPT = 64
 _NAMES_SHOWN = 30
+Reader = Callable[[bytes], tuple[float, ...]]
 
 
 class Message:
@@ -59,13 +59,11 @@ class Message:
         self.profile, self.data_ids = _protection(statements, raw_id, where)
         if self.profile and self.length < 3:
             raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")
-        self.valid, self._protect = make_protection(self.profile, self.length, self.data_ids)
-        self._writers: dict[tuple[str, ...], Writer] = {}
 
     def with_signals(self, signals: Mapping[str, Signal]) -> Message:
         """The same message with some signals in other units."""
         other = copy.copy(self)
-        other.signals, other._writers = {**self.signals, **signals}, {}
+        other.signals = {**self.signals, **signals}
         return other
 
     @property
@@ -84,28 +82,11 @@ class Message:
 
         The CRC is filled in.
         """
-        names = tuple(values)
-        writer = self._writers.get(names)
-        if writer is None:
-            if len(self._writers) >= _WRITERS_KEPT:
-                self._writers.clear()
-            writer = self._writers[names] = self.writer(*names)
-        data = writer(*values.values())
-        if not under:
-            return data
-        both = int.from_bytes(data, "little") | int.from_bytes(under, "little")
-        return self._protect(both.to_bytes(self.length, "little"))
-
-    def writer(self, *names: str) -> Writer:
-        """A fast function from physical values of ``names`` to the frame's bytes. Raises EncodeError."""
-        signals = [self._known(name) for name in names]
-
-        def refuse(*values: float) -> bytes:
-            for signal, value in zip(signals, values, strict=True):
-                signal.to_bits(value)
-            raise EncodeError(f"{self.name}: {dict(zip(names, values, strict=True))} can't be sent")
-
-        return make_writer(self.length, signals, self._protect, refuse)
+        frame = int.from_bytes(under, "little")
+        for name, value in values.items():
+            signal = self._known(name)
+            frame |= signal.placed(signal.to_bits(value), self.length)
+        return self._protected(frame.to_bytes(self.length, "little"))
 
     def _known(self, name: str) -> Signal:
         signal = self.signals.get(name)
@@ -113,9 +94,18 @@ class Message:
             raise EncodeError(f"{self.name} has no signal {name}")
         return signal
 
+    def valid(self, data: bytes) -> bool:
+        """Is the CRC of a frame of the right length right?"""
+        size = CRC_BYTES[self.profile]
+        return not size or data[:size] == crc_of(self.profile, data, self.data_ids)
+
     def protect(self, data: bytearray) -> None:
         """Fill in the CRC of the message's E2E profile."""
-        data[:] = self._protect(bytes(data))
+        data[:] = self._protected(bytes(data))
+
+    def _protected(self, data: bytes) -> bytes:
+        size = CRC_BYTES[self.profile]
+        return crc_of(self.profile, data, self.data_ids) + data[size:] if size else data
 
     def decode(self, data: bytes) -> dict[str, float]:
         """All signals of this frame as physical values. Raises DecodeError for a wrong length or CRC."""
@@ -123,23 +113,20 @@ class Message:
             raise DecodeError(f"{self.name}: {len(data)} bytes instead of {self.length}")
         if not self.valid(data):
             raise DecodeError(f"{self.name}: wrong CRC")
-        values = dict(zip(self.signals, self._all(data), strict=True))
+        values = {name: signal.of_frame(data) for name, signal in self.signals.items()}
         if not self.behind:
             return values
         return {name: value for name, value in values.items() if self._has(name, values)}
-
-    @cached_property
-    def _all(self) -> Reader:
-        return self.reader(*self.signals)
 
     def _has(self, name: str, values: Mapping[str, float]) -> bool:
         """Is a signal in the frame whose multiplexers have these values?"""
         selector, wanted = self.behind.get(name, ("", ()))
         return not selector or values.get(selector) in wanted
 
-    def reader(self, *names: str, whole: Collection[str] = ()) -> Reader:
-        """A fast function from bytes of the right length to values of ``names``; ``whole`` ones as int."""
-        return make_reader(self.length, [self.signals[name] for name in names], [n in whole for n in names])
+    def reader(self, *names: str) -> Reader:
+        """A function from bytes of the right length to the values of ``names``."""
+        signals = [self.signals[name] for name in names]
+        return lambda data: tuple(signal.of_frame(data) for signal in signals)
 
 
 def _signals(

@@ -34,3 +34,10 @@ def crc_profile_2(data: bytes, data_ids: bytes) -> int:
 def crc_profile_5(data: bytes, data_id: int) -> int:
     """CRC-16 of a frame, over bytes 2.. and the data id."""
     return crc_hqx(bytes((data_id & 0xFF, data_id >> 8)), crc_hqx(data[2:], 0xFFFF))
+
+
+def crc_of(profile: int, data: bytes, data_ids: bytes) -> bytes:
+    """The first bytes of a frame of profile 2 or 5; ``data_ids`` as the DBC's attribute has them."""
+    if profile == 2:
+        return bytes((crc_profile_2(data, data_ids),))
+    return crc_profile_5(data, int.from_bytes(data_ids, "big")).to_bytes(2, "little")

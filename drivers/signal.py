@@ -1,15 +1,15 @@
 """One signal of a frame: where its bits are, what they mean, and the exact rules in both directions.
 
-phys = raw * scale + offset in float64, raw = rint((phys - offset) / scale). This is the plain form that
-:mod:`drivers.compiled` unrolls; it also words the error when a value does not fit.
+phys = raw * scale + offset in float64, raw = rint((phys - offset) / scale). What a tick sends and receives
+goes through the same rules as kernels, :mod:`drivers.wire`; here the error is worded when a value misfits.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 from drivers.errors import DatabaseError, EncodeError
 
@@ -34,6 +34,14 @@ class Signal:
     minimum: float
     maximum: float
     unit: str
+    _range: tuple[int, int] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        half = 1 << (self.length - 1)
+        low, high = (-half, half - 1) if self.signed else (0, 2 * half - 1)
+        ends = sorted((bound - self.offset) / self.scale for bound in (self.minimum, self.maximum))
+        limits = max(low, _whole(ends[0], math.ceil, low)), min(high, _whole(ends[1], math.floor, high))
+        object.__setattr__(self, "_range", limits)
 
     @property
     def top(self) -> float:
@@ -90,10 +98,12 @@ class Signal:
 
     def raw_range(self) -> tuple[int, int]:
         """Smallest and largest raw integer that both the bits and the DBC's range allow."""
-        half = 1 << (self.length - 1)
-        low, high = (-half, half - 1) if self.signed else (0, 2 * half - 1)
-        ends = sorted((bound - self.offset) / self.scale for bound in (self.minimum, self.maximum))
-        return max(low, _whole(ends[0], math.ceil, low)), min(high, _whole(ends[1], math.floor, high))
+        return self._range
+
+    def of_frame(self, data: bytes) -> float:
+        """Physical value in a frame of its message's length."""
+        order: Literal["big", "little"] = "big" if self.big_endian else "little"
+        return self.to_phys(int.from_bytes(data, order) >> self.shift & ((1 << self.length) - 1))
 
     def to_phys(self, bits: int) -> float:
         """Physical value of the signal's bits."""
