@@ -19,9 +19,13 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from numba.core import caching, runtime
+from llvmlite import binding
+from numba.core import caching, codegen, compiler, environment, runtime
 
 numba_caching: Any = caching  # ships no types
+numba_codegen: Any = codegen
+numba_compiler: Any = compiler
+numba_environment: Any = environment
 numba_runtime: Any = runtime
 ROOT: Final = Path(__file__).resolve().parents[1]
 PACKAGES: Final = ("hil", "drivers", "firmware_model")
@@ -142,8 +146,80 @@ def _locator(py_file: str) -> KernelLocator | None:
     return locator
 
 
+class KeptLibrary(numba_codegen.JITCodeLibrary):  # type: ignore[misc] # as above
+    """The machine code of a kept kernel. Its bitcode is parsed when another kernel is compiled with it.
+
+    numba's own parses it at once and reads every name in it, which takes longer than to load the code.
+    """
+
+    _bitcode: bytes | None = None
+    _parsed: Any = None
+
+    @classmethod
+    def kept(cls, target: Any, state: tuple[str, str, tuple[bytes, bytes]]) -> KeptLibrary:
+        """The library that ``serialize_using_object_code`` made ``state`` of."""
+        name, _, (code, bitcode) = state
+        library = cls(target, name)
+        library.enable_object_caching()
+        library._set_compiled_object(code)
+        library._finalize_final_module()
+        library._bitcode = bitcode
+        return library
+
+    @property
+    def _shared_module(self) -> Any:
+        if self._parsed is None and self._bitcode is not None:
+            self._parsed = binding.parse_bitcode(self._bitcode)
+            self._codegen._engine._load_defined_symbols(self._parsed)
+        return self._parsed
+
+    @_shared_module.setter
+    def _shared_module(self, module: Any) -> None:
+        self._parsed = module
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Address of a function, 0 where there is none of the name."""
+        return int(self._codegen._engine.get_function_address(name))
+
+
 class _Kernels(numba_caching.CompileResultCacheImpl):  # type: ignore[misc] # as above
     _locator_classes = (KernelLocator, *numba_caching.CacheImpl._locator_classes)
+
+    def reduce(self, cres: Any) -> Any:
+        """What is kept of a kernel. To load it imports no module of numba's: its globals are not used."""
+        *kept, environments = super().reduce(cres)
+        return (*kept, tuple(map(_without_globals, environments)))
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        """The kernel of ``CompileResult._reduce``, its library a :class:`KeptLibrary`."""
+        made = numba_compiler.CompileResult._rebuild(_Keeping(target_context), *payload)
+        return made._replace(target_context=target_context)
+
+
+def _without_globals(env: Any) -> Any:
+    """The same environment of a function of numba's own, by which its module is not imported to load it."""
+    if not env.globals["__name__"].startswith("numba."):
+        return env
+    bare = numba_environment.Environment({"__name__": "numba"})
+    bare.consts[:], bare.env_name = env.consts, env.env_name
+    return bare
+
+
+class _Keeping:
+    """numba's context of the processor; libraries that it reads are :class:`KeptLibrary`."""
+
+    def __init__(self, context: Any) -> None:
+        self._context = context
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._context, name)
+
+    def codegen(self) -> Any:
+        """What reads a library: itself, with the one method that is asked for."""
+        return self
+
+    def unserialize_library(self, state: Any) -> KeptLibrary:
+        return KeptLibrary.kept(self._context.codegen(), state)
 
 
 class KernelFiles(numba_caching.IndexDataCacheFile):  # type: ignore[misc] # as above
@@ -178,14 +254,23 @@ def _locked(folder: str) -> Iterator[None]:
 
 
 class KernelCache(numba_caching.FunctionCache):  # type: ignore[misc] # as above
-    """numba's cache of one function, with :class:`KernelLocator` and :class:`KernelFiles`."""
+    """numba's cache of one function, with :class:`KernelLocator` and :class:`KernelFiles`.
+
+    Most functions are only ever parts of kernels: nothing is looked for before the first is asked for.
+    """
 
     _impl_class = _Kernels
 
     def __init__(self, py_func: Any) -> None:
-        super().__init__(py_func)
+        self._kernel = py_func
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or "_kernel" not in vars(self) or "_impl" in vars(self):
+            raise AttributeError(name)
+        super().__init__(self._kernel)
         locator, base = self._impl.locator, self._impl.filename_base
         self._cache_file = KernelFiles(self._cache_path, base, locator.get_source_stamp())
+        return getattr(self, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """A kept kernel, or None. numba's own reads in first what types and implements each builtin.

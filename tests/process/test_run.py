@@ -278,11 +278,12 @@ import can  # as a run has it, which must not bring the rest
 print(code, *sorted({name.split(".")[0] for name in sys.modules} | set(sys.modules)))
 """
 NOT_FOR_A_LOOP = (
-    "asammdf", "coverage", "dask", "distributed", "h5py", "IPython", "matplotlib", "mcap.writer", "openpyxl",
-    "pandas", "PIL", "plotly", "polars", "pyarrow", "rerun", "rich", "scipy.io", "scipy.linalg",
-    "scipy.optimize", "scipy.signal", "scipy.special", "scipy.stats", "textual", "websockets",
+    "asammdf", "coverage", "dask", "distributed", "firmware_model", "h5py", "IPython", "matplotlib",
+    "mcap.writer", "numba.np.arrayobj", "openpyxl", "pandas", "PIL", "plotly", "polars", "pyarrow", "rerun",
+    "rich", "scipy.io", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.special", "scipy.stats",
+    "textual", "websockets",
 )  # fmt: skip
-"""What takes long to load and is for other commands: exports, campaigns, pages, the terminal."""
+"""What takes long to load and is for exports, campaigns, pages, the terminal, the emulated drive, compiling."""
 
 
 def loaded(*words: str) -> list[str]:
