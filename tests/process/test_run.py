@@ -283,7 +283,7 @@ NOT_FOR_A_LOOP = (
     "rich", "scipy.io", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.special", "scipy.stats",
     "textual", "websockets",
 )  # fmt: skip
-"""What takes long to load and is for exports, campaigns, pages, the terminal, the emulated drive, compiling."""
+"""What takes long to load and is for exports, campaigns, pages, the terminal, the drive, compiling."""
 
 
 def loaded(*words: str) -> list[str]:
