@@ -147,14 +147,18 @@ class Ring:
         os.close(self.fd)
 
 
-def attach(pid: int, name: str) -> Ring:
-    """Open another process's ring for viewing. Raises RingError when it has none of that name."""
+def attach(pid: int, name: str, record_size: int) -> Ring:
+    """Open another process's ring for viewing. Raises RingError when it has none of that name and size."""
     wanted = f"/memfd:hil-{name} (deleted)"
     try:
         for link in Path(f"/proc/{pid}/fd").iterdir():
             with contextlib.suppress(FileNotFoundError):  # closed meanwhile
                 if str(link.readlink()) == wanted:
-                    return Ring(os.open(link, os.O_RDONLY | os.O_CLOEXEC), view=True)
+                    ring = Ring(os.open(link, os.O_RDONLY | os.O_CLOEXEC), view=True)
+                    if ring.record_size == record_size:
+                        return ring
+                    ring.close()
+                    raise RingError(f"process {pid} is of another version of hil: use that one's commands")
     except OSError as error:
         raise RingError(f"process {pid}: can't be looked into ({error.strerror})") from error
     raise RingError(f"process {pid} has no ring {name!r}")

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from hil.errors import plain
 from hil.log.ring import RingError, attach
 from hil.runtime.clock import RealClock
-from hil.signals import DriveState, ticks_from
+from hil.signals import TICK, DriveState, ticks_from
 
 REFRESH_NS = 100_000_000
 
@@ -45,7 +45,7 @@ def draw(pid: int, total: int) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     clock = RealClock()
-    ring = attach(pid, "ticks")
+    ring = attach(pid, "ticks", TICK.itemsize)
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -68,7 +68,7 @@ def draw(pid: int, total: int) -> None:
 def _alive(pid: int) -> bool:
     """True while the process has its ring."""
     try:
-        attach(pid, "ticks").close()
+        attach(pid, "ticks", TICK.itemsize).close()
     except RingError:
         return False
     return True

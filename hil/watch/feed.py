@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from hil.runtime.registry import WatchError, matching, no_node
+from hil.runtime.registry import WatchError, is_alive, matching, no_node
 from hil.signals import FIELDS, Field, TickArray
 from hil.watch.look import Look, figures, outcome
 
@@ -106,8 +106,8 @@ class Feed:
             return self._status(why)
         try:
             self._look = Look(found[0], self._node)
-        except WatchError:
-            return []  # it ended between the two
+        except WatchError as error:  # it ended between the two, or is of another version
+            return self._status(str(error)) if is_alive(found[0]) else []
         entry = found[0]
         run = {"pid": entry.pid, "bus": entry.bus, "log": entry.log, "rate_hz": entry.rate_hz}
         run |= {"node": self._look.node} if entry.nodes else {}

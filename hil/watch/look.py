@@ -15,7 +15,7 @@ from hil.log.ring import RingError, attach
 from hil.runtime.clock import RealClock
 from hil.runtime.inbox import SetpointError, ask, outside, shown
 from hil.runtime.registry import Entry, WatchError, ask_stop, is_alive, no_node
-from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
+from hil.signals import TICK, DriveState, Reason, Request, TickArray, ticks_from
 
 SILENT_S, SILENT_PERIODS = 0.3, 3
 """Age from which a tick is no longer news, and at least so many periods."""
@@ -53,9 +53,9 @@ class Look:
         if why := no_node(entry, node):
             raise WatchError(why)
         try:
-            self._ticks = attach(entry.pid, ring_of(entry, self.node))
+            self._ticks = attach(entry.pid, ring_of(entry, self.node), TICK.itemsize)
             try:
-                self._events = attach(entry.pid, "events")
+                self._events = attach(entry.pid, "events", EVENT_BYTES)
             except RingError:
                 self._ticks.close()
                 raise

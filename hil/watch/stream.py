@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hil.log.records import FRAME_RECORD
 from hil.log.ring import RingError, attach
 from hil.log.schema import (
     FRAME,
@@ -59,7 +60,7 @@ class Stream:
     def __init__(self, look: Look, to: dict[str, Any]) -> None:
         self._look, self._to = look, to
         try:
-            self._frames = attach(look.entry.pid, "frames")
+            self._frames = attach(look.entry.pid, "frames", FRAME_RECORD.size)
         except RingError as error:
             raise WatchError(str(error)) from error
         self._frames_seen = self._frames.published

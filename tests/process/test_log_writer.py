@@ -166,7 +166,7 @@ def test_a_slow_writer_drops_counts_and_names_the_gap(tmp_path: Path) -> None:
         push(recorder, some_ticks(capacity + 123))
         assert recorder.dropped == 123
         os.kill(recorder.writer_pid, signal.SIGCONT)
-        ring = attach(os.getpid(), "ticks")
+        ring = attach(os.getpid(), "ticks", TICK.itemsize)
         wait_for(lambda: bool(ring.header[3] == ring.header[4]), 10)
         ring.close()
         push(recorder, some_ticks(10, capacity + 123))
@@ -313,7 +313,7 @@ def test_a_viewer_follows_a_run_without_the_writer_noticing(tmp_path: Path) -> N
     path, ticks = tmp_path / "run.mcap", some_ticks(50)
     with recording(path) as recorder:
         push(recorder, ticks)
-        ring = attach(os.getpid(), "ticks")
+        ring = attach(os.getpid(), "ticks", TICK.itemsize)
         assert ring.latest(3) == ticks[-3:].tobytes() and ring.record_size == TICK.itemsize
         ring.close()
         assert recorder.close({"ended": "stop_requested"})

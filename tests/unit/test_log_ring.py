@@ -203,11 +203,11 @@ def test_many_by_the_kernel_are_many_by_the_ring(steps: list[tuple[int, bool]]) 
 def test_another_process_can_attach_by_pid() -> None:
     ring = Ring.create("test-attach", SIZE, 8)
     ring.push(record(5))
-    view = attach(os.getpid(), "test-attach")
+    view = attach(os.getpid(), "test-attach", SIZE)
     assert numbers(view.latest(3)) == [5]
     with pytest.raises(TypeError):
         view.push(record(6))
     view.close()
     with pytest.raises(RingError, match="no ring"):
-        attach(os.getpid(), "none")
+        attach(os.getpid(), "none", SIZE)
     ring.close()

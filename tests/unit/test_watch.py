@@ -187,6 +187,13 @@ def test_a_process_without_rings_is_refused() -> None:
         Look(entry())
 
 
+def test_a_run_of_another_version_is_refused() -> None:
+    other = Ring.create("ticks", TICK.itemsize + 8, 4)
+    with pytest.raises(WatchError, match=f"process {os.getpid()} is of another version of hil"):
+        Look(entry())
+    other.close()
+
+
 def test_events_come_back_from_their_records() -> None:
     raw = pack_event_record(1, 2, "state", "äh") + pack_event_record(3, 4, "stop", "")
     assert unpack_events(raw) == [(1, 2, "state", "äh"), (3, 4, "stop", "")]
