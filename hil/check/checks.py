@@ -21,6 +21,7 @@ from drivers.mapping import MEASURED
 from hil.check.filtered import filter_rows
 from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
 from hil.check.seldom import seldom_rows
+from hil.check.shaft import shaft_rows
 from hil.config.limits import LimitsTable
 from hil.config.loop import BusTable
 from hil.control.law import CASCADE, PI
@@ -56,6 +57,7 @@ def check(setup: Setup) -> list[Row]:
         *reach_rows(setup),
         *speed_filter_rows(setup),
         *seldom_rows(setup),
+        *shaft_rows(setup),
         load_row(setup),
         *adaptive_rows(setup),
         *heard_rows(setup),
@@ -72,7 +74,7 @@ def check_nodes(setups: Nodes) -> list[Row]:
     config = first.config
     rows = bus_rows(first)
     for name, setup in setups.items():
-        own = [*reach_rows(setup), *speed_filter_rows(setup), *adaptive_rows(setup)]
+        own = [*reach_rows(setup), *speed_filter_rows(setup), *shaft_rows(setup), *adaptive_rows(setup)]
         own += [*heard_rows(setup), *canopen_rows(setup)]
         rows += [replace(one, check=f"{name}: {one.check}") for one in own]
     found, good = nodes_load(setups)

@@ -67,7 +67,7 @@ def _told(keys: list[Key]) -> Iterator[str]:
     for key in keys:
         same.setdefault((key.key, key.facts, key.doc), []).append(key.kind or "")
     for (name, facts, doc), kinds in same.items():
-        yield f"{name}{_of(', '.join(kinds))}: {facts}\n    {doc}"
+        yield f"{name}{_of(', '.join(filter(None, kinds)))}: {facts}\n    {doc}"
 
 
 def _of(kind: object) -> str:

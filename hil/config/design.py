@@ -156,7 +156,9 @@ def motor_model(table: MotorTable) -> MotorModel:
 
 def _values(table: Any) -> dict[str, Any]:
     """The keys of a law's or an observer's table, without what every one has."""
-    keys: dict[str, Any] = table.model_dump(exclude={"kind", "compensate_coupling", "anticogging"})
+    keys: dict[str, Any] = table.model_dump(
+        exclude={"kind", "compensate_coupling", "anticogging", "known_load"}
+    )
     return keys
 
 
@@ -238,10 +240,65 @@ def known_cogging(config: RunConfig) -> Harmonics | None:
             f"(i_max_a, torque_max_n_m); learn it anew, or take it out"
         )
     known: Harmonics = given.known
+    _each_tick(config, where)
+    return known
+
+
+def _each_tick(config: RunConfig, where: str) -> None:
+    """Refuse what goes by the angle where that is not measured in each tick."""
     inner = inner_loop(config)
     if inner is not None and inner.every > 1:
         raise ControlDesignError(f"{where}: needs the angle in each tick; leave it or feedback.period_ms out")
-    return known
+
+
+def known_over_angle(config: RunConfig) -> Harmonics | None:
+    """What is known over the angle in all: cogging, and a weight's torque. Raises ControlDesignError."""
+    cogging, weight = known_cogging(config), known_weight(config)
+    if cogging is None or weight is None:
+        return weight if cogging is None else cogging
+    if 1 in cogging.orders:
+        raise ControlDesignError(
+            "controller.known_load.gravity_n_m: the table of controller.anticogging has order 1, in which "
+            "the weight's torque is already; leave gravity_n_m out"
+        )
+    return Harmonics((*weight.orders, *cogging.orders), (*weight.a, *cogging.a), (*weight.b, *cogging.b))
+
+
+def known_weight(config: RunConfig) -> Harmonics | None:
+    """The torque of a weight over the angle. Raises ControlDesignError for a known load that can not be."""
+    given, where = config.controller.known_load, "controller.known_load"
+    if given is None:
+        return None
+    if config.controller.kind == "torque":
+        raise ControlDesignError(
+            f"{where}: the law torque follows no speed and gives what its table says; leave the key out"
+        )
+    most = min(config.k_t * config.limits.i_max_a, config.limits.torque_max_n_m or math.inf)
+    w = config.limits.w_max_rad_s
+    for key, peak, at in (
+        ("quadratic_n_m_s2", given.quadratic_n_m_s2 * w * w, f" at limits.w_max_rad_s = {w:g}"),
+        ("gravity_n_m", given.gravity_n_m, ""),
+    ):
+        if peak > most:
+            raise ControlDesignError(
+                f"{where}.{key}: {peak:.4g} N m{at}, the limits allow {most:.4g} N m (i_max_a, "
+                "torque_max_n_m); "
+                "is it in N m?"
+            )
+    if not given.gravity_n_m:
+        return None
+    _each_tick(config, f"{where}.gravity_n_m")
+    weight: Harmonics = given.over_angle
+    return weight
+
+
+def by_angle(config: RunConfig) -> str:
+    """The key of what needs the shaft's angle; empty where nothing does."""
+    controller = config.controller
+    if controller.anticogging is not None:
+        return "controller.anticogging"
+    known = controller.known_load
+    return "controller.known_load.gravity_n_m" if known is not None and known.gravity_n_m else ""
 
 
 def regen_limit(limits: LimitsTable) -> RegenLimit | None:
@@ -265,7 +322,9 @@ def law_spec(config: RunConfig, told: bool = True) -> LawSpec:
         i_max=config.limits.i_max_a,
         T_L_max=config.limits.T_L_max_n_m,
         coupling=controller.compensate_coupling,
-        cogging=known_cogging(config),
+        cogging=known_over_angle(config),
+        k_w2=controller.known_load.quadratic_n_m_s2 if controller.known_load else 0.0,
+        shaft=elastic_shaft(config.motor) if config.drive.takes == "voltage" else None,
         regen=regen_limit(config.limits),
         more=_values(controller),
     )
@@ -395,10 +454,9 @@ def reference_record(table: ReferenceTable) -> Record:
 def build(config: RunConfig, wire: WireFacts) -> Machine:
     """Design the controller of a run. Raises ControlDesignError."""
     told = not wire.absent & NO_I_Q
-    if config.controller.anticogging is not None and "angle" not in wire.measured:
+    if (key := by_angle(config)) and "angle" not in wire.measured:
         raise ControlDesignError(
-            "controller.anticogging: the drive reports no angle; name it in drive.signals.angle, or leave "
-            "this out"
+            f"{key}: the drive reports no angle; name it in drive.signals.angle, or leave this out"
         )
     law = design_law(law_spec(config, told), 1.0 / config.loop.rate_hz)
     return Machine(

@@ -8,13 +8,16 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from hil.config.design import Machine, inner_loop, motor_model, speed_filter
+from hil.config.design import Machine, elastic_shaft, inner_loop, motor_model, speed_filter
 from hil.config.tables import RunConfig
 from hil.control.registry import SpeedFilter
 from hil.errors import ConfigError
 
 if TYPE_CHECKING:
     from hil.tuning.current import Loop
+
+SHAKEN_S = 3.0
+"""Time for which a loop on its shaft is watched."""
 
 
 def loop_through(config: RunConfig, machine: Machine, given: SpeedFilter | None) -> Loop:
@@ -66,6 +69,21 @@ def refuse_unstable(where: str, config: RunConfig, machine: Machine, w_lsb: floa
                 "drive"
             ],
         )
+
+
+def refuse_shaking(where: str, config: RunConfig, machine: Machine) -> None:
+    """Raise ConfigError for a shaft on which the tuning of a drive that takes voltages is not stable."""
+    shaft = elastic_shaft(config.motor)
+    if shaft is None or machine.law["rows"][0]:  # an experiment closes no loop
+        return
+    from hil.tuning.measure import Bench, quiet  # loads scipy
+
+    motor, w = motor_model(config.motor), abs(float(machine.reference["w"][0]))
+    bench = Bench(motor, 1.0 / config.loop.rate_hz, 1.0, 0.0, 0.0, w_0=w)
+    if not all(quiet(machine.law, bench, [(motor, shaft.elastic)], SHAKEN_S)):
+        hz = config.motor.shaft.resonance_hz if config.motor.shaft else 0.0
+        text = f"the loop is not stable on a shaft of {hz:g} Hz"
+        raise ConfigError(where, [f"motor.shaft: {text}; take a lower controller.speed_pole_rad_s"])
 
 
 def _unstable(table: Any) -> str:

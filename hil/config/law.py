@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Union
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, TypeAdapter, create_model
 
-from hil.config.motor import AnticoggingTable, IdTable
+from hil.config.motor import AnticoggingTable, IdTable, KnownLoadTable
 from hil.config.table import LEAST, MOST, Table, included
 from hil.control.registry import REQUIRED, Key, laws, observers
 
@@ -64,6 +64,7 @@ def _law_kind(value: Any) -> Any:
 ANTICOGGING = (
     "Load torque over the angle to compensate: a file of hil identify --steps cogging; left out: none."
 )
+KNOWN_LOAD = "Load torque by speed and angle that is known beforehand; left out: none."
 COUPLING = "Reluctance torque and cross-coupling are known terms; false: the observers find them."
 if typing.TYPE_CHECKING:
     ChannelTable = Any
@@ -80,6 +81,7 @@ else:
                 Annotated[AnticoggingTable | None, BeforeValidator(included)],
                 Field(None, description=ANTICOGGING),
             ),
+            "known_load": (KnownLoadTable | None, Field(None, description=KNOWN_LOAD)),
         },
     )
     """The control law: a table of each registered kind (:mod:`hil.control.laws`)."""

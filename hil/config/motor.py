@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -63,7 +64,7 @@ class IdentifiedTable(Table):
 
 
 class ShaftTable(Table):
-    """An elastic shaft between motor and load that the observer of the law ``speed`` takes into its model.
+    """An elastic shaft between motor and load that the observer takes into its model.
 
     What it does is then no part of the estimate, which is that of the torque on the load.
     """
@@ -96,7 +97,7 @@ class MotorTable(Table):
     B_f_n_m_s: NonNegative = 0.0
     """Viscous friction B_f: torque over mechanical speed."""
     shaft: ShaftTable | None = None
-    """The elastic shaft to the load, of a drive that takes a current or a torque; left out: a rigid one."""
+    """The elastic shaft to the load; left out: a rigid one."""
     identified: IdentifiedTable | None = None
     """Where the values come from, when hil identify found them."""
 
@@ -118,6 +119,28 @@ class IdTable(Table):
         if self.i_q_a[0] != 0.0 or any(a >= b for a, b in zip(self.i_q_a, self.i_q_a[1:], strict=False)):
             raise ValueError("i_q_a must ascend from 0; sort the rows by i_q_a, each once")
         return self
+
+
+class KnownLoadTable(Table):
+    """Load torque that is known beforehand, against positive speed: T = k w |w| + G sin(theta - zero).
+
+    The observer estimates what is left of the load, and the law asks for this without waiting for it.
+    """
+
+    quadratic_n_m_s2: NonNegative = 0.0
+    """k, torque over the square of the speed: a fan or a pump."""
+    gravity_n_m: NonNegative = 0.0
+    """G, largest torque of a weight on an arm; the drive has to report the angle."""
+    gravity_zero_rad: Finite = 0.0
+    """Angle at which the weight hangs, its torque is 0 and grows with the angle."""
+
+    @property
+    def over_angle(self) -> Harmonics:
+        """The part over the angle: order 1."""
+        if not self.gravity_n_m:
+            return Harmonics((), (), ())
+        G, zero = self.gravity_n_m, self.gravity_zero_rad
+        return Harmonics((1,), (-G * math.sin(zero),), (G * math.cos(zero),))
 
 
 class AnticoggingTable(Table):

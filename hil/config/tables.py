@@ -69,10 +69,10 @@ class RunConfig(Table):
 
     @model_validator(mode="after")
     def _shaft_in_its_model(self) -> RunConfig:
-        if self.motor.shaft is not None and self.drive.takes == "voltage":
+        if self.motor.shaft is not None and self.controller.kind == "fac":
             raise ValueError(
-                "motor.shaft: the drive takes voltages, and no law for those has the shaft in its model; "
-                "remove it, and give hil design --shaft"
+                "motor.shaft: the law fac commands the load itself, without a shaft in its model; remove it, "
+                "or take another controller.kind"
             )
         return self
 

@@ -1,6 +1,6 @@
-"""The load torque over the shaft's angle that is known beforehand, as harmonics of named orders.
+"""The load torque that is known beforehand: harmonics of named orders over the shaft's angle, and by speed.
 
-    T_c(theta) = sum_m a_m cos(n_m theta) + b_m sin(n_m theta)   [N m], against positive speed, as T_L
+    T_c(theta, w) = sum_m a_m cos(n_m theta) + b_m sin(n_m theta) + k w |w|   [N m], against positive speed
 
 It is a known term of the model, as reluctance torque is: the observer finds what is left, and the law
 compensates it at the angles at which its command will act. A harmonic that changes too fast for the period is
@@ -60,11 +60,16 @@ def basis(theta: Any, orders: Sequence[int]) -> Any:
     return np.stack([np.cos(angles), np.sin(angles)], axis=2).reshape(len(angles), -1)
 
 
-def cog_params(known: Harmonics | None, lead: float, lag: float, T_s: float) -> dict[str, Any]:
-    """The part of LAW_PARAMS: :func:`ahead` has ``lead`` [s] and ``lag``.
+def cog_params(
+    known: Harmonics | None, lead: float, lag: float, T_s: float, k_w2: float = 0.0
+) -> dict[str, Any]:
+    """The part of LAW_PARAMS: :func:`ahead` has ``lead`` [s] and ``lag``; k_w2 [N m s2/rad2] of k w |w|.
 
     Empty where nothing is known. Raises ControlDesignError.
     """
+    if not 0.0 <= k_w2 < math.inf:
+        raise ControlDesignError(f"known_load: quadratic is {k_w2}; 0 and more")
+    known = Harmonics((), (), ()) if known is None and k_w2 else known
     if known is None:
         return {}
     orders = np.asarray(known.orders)
@@ -82,6 +87,7 @@ def cog_params(known: Harmonics | None, lead: float, lag: float, T_s: float) -> 
         "cog_lead": lead,
         "cog_lag": lag,
         "cog_slow": SLOW / T_s,
+        "k_w2": k_w2,
     }
 
 
@@ -140,10 +146,26 @@ def torque_at(p: Any, theta: float, w: float) -> float:
 
 
 @jit
+def loaded(p: Any) -> bool:
+    """Whether a load is known beforehand."""
+    return bool(p["cogs"] > 0 or p["k_w2"] != 0.0)
+
+
+@jit
+def known_load(p: Any, s: Any, after: float) -> float:
+    """T_c [N m], ``after`` [s] from the measurement by the measured speed."""
+    w, total = s["x"][0], 0.0
+    if p["cogs"] > 0:
+        total = torque_at(p, s["theta"] + after * w, w)
+    if p["k_w2"] != 0.0:
+        total += p["k_w2"] * w * abs(w)
+    return float(total)
+
+
+@jit
 def ripple(p: Any, s: Any, after: float) -> float:
-    """-T_c / J [rad/s2], ``after`` [s] from the measurement by the measured speed."""
-    w = s["x"][0]
-    return float(-torque_at(p, s["theta"] + after * w, w) / p["J"])
+    """-T_c / J [rad/s2], as :func:`known_load`."""
+    return float(-known_load(p, s, after) / p["J"])
 
 
 @jit

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hil.control.adaptive import remember
-from hil.control.cogging import ORDERS, Harmonics, ahead, cog_params, ripple
+from hil.control.cogging import ORDERS, Harmonics, ahead, cog_params, loaded, ripple
 from hil.control.composite import predict
 from hil.control.errors import ControlDesignError
 from hil.control.fac import MAX_GAP, SampledModel, sample
@@ -29,9 +29,19 @@ from hil.control.linalg import Array, copy, exp, matvec, matvec_add
 from hil.control.mtpa import POINTS, operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.regen import RegenLimit, braked, regen_params
-from hil.control.registry import Channel, InnerLoop, Plan, laws, member, observers
+from hil.control.registry import Channel, InnerLoop, Plan, Shaft, laws, member, observers
 from hil.control.speed import COMMANDS, ask_speed
-from hil.control.speedfilter import PAST, ROOM, behind, filter_params, hear, innovation, ticks_of
+from hil.control.speedfilter import (
+    PAST,
+    ROOM,
+    behind,
+    enter,
+    filter_params,
+    hear,
+    innovation,
+    shaft_params,
+    ticks_of,
+)
 
 N_MAX: Final = 1024
 """Longest window D [ticks] that the record has room for."""
@@ -133,6 +143,7 @@ LAW_PARAMS: Final = np.dtype(
         ("points", "i8"),
         ("i_q_at", "f8", POINTS),
         ("i_d_at", "f8", POINTS),
+        ("k_w2", "f8"),
     ],
     align=True,
 )
@@ -146,7 +157,7 @@ the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to
 several, else 0, and ``span``: what an innovation rests on then, where there is a filter; from ``cogs`` on the
 load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); from ``regen`` on what may go
 back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
-``mtpa`` (:func:`hil.control.mtpa.by_table`)."""
+``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed squared."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -158,8 +169,22 @@ _SELDOM = ("every", "span")
 _COGGING = ("cogs", "cog_order", "cog_a", "cog_b", "cog_lead", "cog_lag", "cog_slow")
 _REGEN = ("regen", "p_regen", "v_regen", "g_regen")
 _TABLED = ("points", "i_q_at", "i_d_at")
+_QUADRATIC = ("k_w2",)
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    (*_SHAPES, *_TABLE, *_BOUNDS, *_INNER, *_FILTER, *_SALIENT, *_SELDOM, *_COGGING, *_REGEN, *_TABLED), 0.0
+    (
+        *_SHAPES,
+        *_TABLE,
+        *_BOUNDS,
+        *_INNER,
+        *_FILTER,
+        *_SALIENT,
+        *_SELDOM,
+        *_COGGING,
+        *_REGEN,
+        *_TABLED,
+        *_QUADRATIC,
+    ),
+    0.0,
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -303,6 +328,10 @@ class LawSpec:
     """The load torque that is known over the shaft's angle."""
     regen: RegenLimit | None = None
     """What may go back to the DC link."""
+    k_w2: float = 0.0
+    """Known load over the speed squared [N m s2/rad2]."""
+    shaft: Shaft | None = None
+    """Behind which the observer of a drive that takes voltages knows the load to be."""
 
     def values(self) -> dict[str, Any]:
         """What the registered design takes."""
@@ -348,9 +377,14 @@ def _window(spec: LawSpec, T_s: float) -> Window:
         if own[0] is not own[1]:
             joint = next(observer.kind for observer in own if observer.joint)
             raise ControlDesignError(f"observer kind {joint} is one for all channels: give it to both")
+        if spec.shaft is not None:
+            raise ControlDesignError(
+                f"motor.shaft: observer kind {own[0].kind} has a model of its own, without a shaft; "
+                "take another, or leave the shaft out"
+            )
         whole: Window = own[0].joint(spec.speed.values(), spec.current.values(), model_of(spec, T_s))
         return whole
-    speed = _shortened(spec.speed, spec.inner, T_s)
+    speed = _shortened(spec.speed, spec.inner, T_s, spec.shaft)
     rows = ((own[0], speed), (own[1], spec.current), (own[1], spec.current))
     model = model_of(spec, T_s)
     return side_by_side(*(_channel(o, c, i, model, T_s) for i, (o, c) in enumerate(rows)))
@@ -362,10 +396,12 @@ def _channel(observer: Any, given: ChannelSpec, index: int, model: SampledModel,
     return window
 
 
-def _shortened(given: ChannelSpec, inner: InnerLoop | None, T_s: float) -> ChannelSpec:
+def _shortened(
+    given: ChannelSpec, inner: InnerLoop | None, T_s: float, shaft: Shaft | None = None
+) -> ChannelSpec:
     """The window that is left of D when each innovation needs ticks itself, for the states of a filter."""
     every, values = 1 if inner is None else inner.every, given.values()
-    ticks = whole_gaps(ticks_of(inner), every)
+    ticks = whole_gaps(ticks_of(inner, shaft), every)
     if given.kind == "adaptive" and (ticks or every > 1):
         of = "without drive.speed_filter and motor.shaft" if ticks else "in each tick, no feedback.period_ms"
         raise ControlDesignError(
@@ -479,8 +515,12 @@ def design_law(spec: LawSpec, T_s: float) -> Record:
     if spec.inner and spec.inner.every > 1:
         values["every"] = spec.inner.every
     gain = spec.inner.k_u / motor.J if spec.inner else 0.0
-    values |= cog_params(spec.cogging, *_lead(spec, values, T_s), T_s) | regen_params(spec.regen, motor.R_s)
-    for name, value in (values | filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)).items():
+    values |= cog_params(spec.cogging, *_lead(spec, values, T_s), T_s, spec.k_w2)
+    values |= regen_params(spec.regen, motor.R_s)
+    values |= filter_params(spec.inner, -motor.B_f / motor.J, gain, T_s)
+    if spec.shaft is not None:
+        values |= shaft_params(spec.shaft, motor.A()[:2, :2], T_s)
+    for name, value in values.items():
         params[name] = value
     for name in ("form", "third", "g", "M", "W", "S", "short", "first"):
         if (part := getattr(window, name)).size:
@@ -522,7 +562,7 @@ def start(p: Any, s: Any) -> None:
     """Take the measurement in s['x'] as the beginning of the observer's first period."""
     copy(s["x"], s["x_open"])
     known_terms(p, s["x"], s["c"])
-    if p["cogs"]:
+    if loaded(p):
         s["c"][0] += ripple(p, s, 0.0)
     s["started"] = 1
     s["gap"] = 0
@@ -544,10 +584,25 @@ def innovate(p: Any, s: Any) -> None:
         s["work"][c] = s["x"][c] - s["x_open"][c]
     matvec(p["gap_inverse"][s["gap"] - 1], s["work"], s["v"])
     known_terms(p, s["x"], s["work"])
-    if p["cogs"]:
+    if loaded(p):
         s["work"][0] += ripple(p, s, 0.0)
     for c in range(3):
         s["v"][c] -= 0.5 * (s["work"][c] - s["c"][c])
+
+
+@jit
+def hear_beside_current(p: Any, s: Any, before: float) -> int:
+    """:func:`hear` after :func:`innovate`, of a drive that takes voltages; i_q was ``before``, is x_1 now.
+
+    What the measured current and the known torques did over the past periods goes into the ring; between
+    the ends of a gap it is taken for straight.
+    """
+    gap, per_torque = s["gap"], p["J"] / p["k_t"]
+    first, last = before + per_torque * s["c"][0], s["x"][1] + per_torque * s["work"][0]
+    bend = (last - first) / gap
+    for period in range(gap):
+        enter(s, first + (period + 0.5) * bend, bend)
+    return int(hear(p, s))
 
 
 @jit
@@ -559,13 +614,15 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
     does a count below 1: there is no such period, and no gap inverse that could be read for it.
     """
     if s["started"]:
-        for _ in range(0 if p["order"] and p["every"] < 2 else min(periods, p["max_gap"] + 1)):
+        skipped = p["order"] > 0 and p["kind"] == SPEED and p["every"] < 2
+        for _ in range(0 if skipped else min(periods, p["max_gap"] + 1)):
             open_loop(p, s)
         s["gap"] += periods
         if periods < 1 or s["gap"] > p["max_gap"]:
             reset(s)
     if not fresh:
         return
+    before = s["x"][1]
     s["x"][0], s["x"][1], s["x"][2] = w, i_q, i_d
     if not s["started"]:
         if p["order"]:
@@ -573,10 +630,12 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
         start(p, s)
         return
     steps = s["gap"]
-    if p["order"]:
+    if p["order"] and p["kind"] == SPEED:
         steps = hear(p, s)
     else:
         innovate(p, s)
+        if p["order"]:
+            steps = hear_beside_current(p, s, before)
     for step in range(steps):
         if p["order"]:
             ago = steps - 1 - step
@@ -592,7 +651,7 @@ def observe(p: Any, s: Any, w: float, i_q: float, i_d: float, fresh: bool, perio
             shape_step(p, s)
     if p["shaped"]:
         remember(p, s, s["gap"])
-    if p["order"]:
+    if p["order"] and p["kind"] == SPEED:
         behind(p, s)
     s["filled"] = min(s["filled"] + steps, max(p["N"][0], p["N"][1], p["N"][2]))
     start(p, s)
@@ -632,12 +691,12 @@ def look_ahead(p: Any, s: Any) -> None:
     copy(s["c"], s["work"])
     if p["short"][2] > 0:  # an adaptive window's i_d is quieter than the measured one
         known_terms(p, s["x_hat"], s["work"])
-        s["work"][0] += ripple(p, s, 0.0) if p["cogs"] else 0.0
+        s["work"][0] += ripple(p, s, 0.0) if loaded(p) else 0.0
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
     predict(p["Ad"], p["Bd"], p["Ed"], s["x_hat"], s["ua"], s["d_p"], s["x_p"])
     known_terms(p, s["x_p"], s["work"])
-    if p["cogs"]:
+    if loaded(p):
         s["work"][0] += ahead(p, s)
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
@@ -752,7 +811,7 @@ def pi_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> None:
     x, k_p, k_i, total = s["x"], p["k_p"], p["k_i"], s["I"]
     e_w = w_ref - x[0]
     asked = k_p[0] * e_w + total[0] + p["J"] * dw_ref / p["k_t"]
-    if p["cogs"]:
+    if loaded(p):
         asked -= p["J"] * ahead(p, s) / p["k_t"]
     i_q_ref = limited_current(p, s, x[0], asked)
     total[0] += p["T_s"] * k_i[0] * (e_w + (i_q_ref - asked) / k_p[0])

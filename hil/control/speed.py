@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from hil.control.cogging import ripple
+from hil.control.cogging import loaded, ripple
 from hil.control.jit import jit
 from hil.control.regen import braked
 from hil.control.speedfilter import enter
@@ -63,7 +63,7 @@ def look_ahead_speed(p: Any, s: Any) -> None:
     w, i, d = s["x"][0], s["inner"], s["d_hat"][0]
     for age in range(p["delay"], -1, -1):
         u = s["commands"][age]
-        if p["cogs"]:
+        if loaded(p):
             d = s["d_hat"][0] + ripple(p, s, (p["delay"] - age + 0.5) * p["T_s"])
         w = p["Ad"][0, 0] * w + p["Bd"][0, 0] * (p["share"] * i + (1.0 - p["share"]) * u)
         w += p["Ed"][0, 0] * d
@@ -89,7 +89,7 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     after = target + T_s * dw_ref
     holds = kappa * (after - a * target - drift) / b
     held = holds
-    if p["cogs"]:
+    if loaded(p):
         share, lead = kappa * p["Ed"][0, 0] / b, p["cog_lead"]
         held = holds - share * ripple(p, s, lead)
         holds -= share * ripple(p, s, lead + T_s)

@@ -12,7 +12,8 @@ as before. To undo a filter costs noise, |r| and |p|: each pole multiplies it by
 more, l = e^{-pole T_s}; a mean does not.
 
 A load behind an elastic shaft is known in the same way: z = (w, twist, w_load, filter's state), with d at the
-load, -T_L / J as ever. What the shaft does is then no part of d_hat.
+load, -T_L / J as ever. What the shaft does is then no part of d_hat. Of a drive that takes voltages the
+measured current is what flowed (:func:`sampled_winding`).
 
 Of a drive that reports in every m-th tick alone the samples are those, y_{k-jm}, with F^m in F's place; what
 flowed is known of each tick all the same. All that n counts then takes m times as long.
@@ -41,18 +42,18 @@ MOST_CONDITION: Final = 1e12
 """Of the samples that z is found from."""
 
 
-def order_of(inner: InnerLoop | None) -> int:
-    """States of filter and shaft that the observer takes into its model."""
+def order_of(inner: InnerLoop | None, shaft: Shaft | None = None) -> int:
+    """States of filter and shaft that the observer takes into its model; ``shaft`` of a drive by voltage."""
     if inner is None:
-        return 0
+        return 2 if shaft else 0
     given = inner.filter or SpeedFilter()
     return (given.ticks or len(given.poles)) + (2 if inner.shaft else 0)
 
 
-def ticks_of(inner: InnerLoop | None) -> int:
+def ticks_of(inner: InnerLoop | None, shaft: Shaft | None = None) -> int:
     """Ticks that an innovation needs for those states, besides the one or the gap that it is of."""
     if inner is None:
-        return 0
+        return order_of(None, shaft)
     averaged = inner.filter is not None and inner.filter.ticks
     return order_of(inner) * (1 if averaged else inner.every)
 
@@ -93,6 +94,23 @@ def sampled_filter(
     C[(3 if shaft else 1) if given.poles or given.ticks else 0] = 1.0
     parts = step[:n, :n], held, S, E, C
     return _averaged(parts, given.ticks, T_s) if given.ticks else parts
+
+
+def sampled_winding(shaft: Shaft, A: Array, T_s: float) -> Any:
+    """F (3, 3), G, S, E, C (3,) of z = (w, twist, w_load), whose currents at both ends of a tick are known.
+
+    A (2, 2) of (w, i_q) of one inertia. What drives the current through a tick is its voltage and all that
+    nobody knows of it, a constant g; from i at its end follows that:
+        z+ = F_zz z + F_zi i + G_z g + E_z d,   g = (i+ - F_iz z - F_ii i - E_i d) / G_i
+    """
+    mass, of_i, of_d = _continuous(SpeedFilter(), float(A[0, 0]), float(A[0, 1]), shaft)
+    whole = np.zeros((6, 6))  # (z, i, g, d)
+    whole[:3, :3], whole[:3, 3], whole[:3, 5] = mass, of_i, of_d
+    whole[3, 0], whole[3, 3], whole[3, 4] = A[1, 0], A[1, 1], 1.0
+    step, _ = integral_exponential(whole, T_s, halvings_of(whole, T_s))
+    at_end = step[:3, 4] / step[3, 4]
+    F, first, E = (step[:3, own] - np.multiply.outer(at_end, step[3, own]) for own in (slice(3), 3, 5))
+    return F, first + at_end, 0.5 * (at_end - first), E, np.eye(3)[0]
 
 
 def _share_of_target(
@@ -239,10 +257,24 @@ def filter_params(inner: InnerLoop | None, friction: float, gain: float, T_s: fl
     _check_room(inner)
     every, more = inner.every, ticks_of(inner)
     lag = None if inner.told and every == 1 else inner.lag  # between two samples the model tells what flows
-    F, G, S, E, C = sampled_filter(given, friction, gain, lag, T_s, shaft)
+    parts = sampled_filter(given, friction, gain, lag, T_s, shaft)
+    return _weights(parts, given, T_s, every, more, 3 if shaft else 1)
+
+
+def shaft_params(shaft: Shaft, A: Array, T_s: float) -> dict[str, Any]:
+    """The shaft's part of LAW_PARAMS, of a drive that takes voltages. Raises ControlDesignError."""
+    _check_shaft(SpeedFilter(), shaft, T_s)
+    return _weights(sampled_winding(shaft, A, T_s), SpeedFilter(), T_s, 1, 2, 3)
+
+
+def _weights(
+    parts: Any, given: SpeedFilter, T_s: float, every: int, more: int, masses: int
+) -> dict[str, Any]:
+    """Of a sampled form: weights of the samples and of what flowed, of innovation and speed."""
+    F, G, S, E, C = parts
     n = len(F)
     rows, none = _rows(F, C, MAX_GAP), np.zeros((more + every, n))
-    r, p = _innovation(given, F, T_s, every, 3 if shaft else 1), _reconstruction(given, F, C, every)
+    r, p = _innovation(given, F, T_s, every, masses), _reconstruction(given, F, C, every)
     v_u, v_s, v_d = _known(r, rows, none, (G, S, E), every)
     w_u, w_s, w_d = _known(p, rows, _rows(F, np.eye(n)[0], n * every)[:more], (G, S, E), every)
     scale = -math.fsum(v_d)

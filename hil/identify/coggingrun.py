@@ -84,8 +84,8 @@ def table_of(found: Cogging, config: RunConfig, logs: Sequence[str]) -> Anticogg
 
 
 def with_table(config: RunConfig, table: AnticoggingTable | None) -> RunConfig:
-    """The configuration with that table."""
-    controller = config.controller.model_copy(update={"anticogging": table})
+    """The configuration with that table, in which a weight's torque is too."""
+    controller = config.controller.model_copy(update={"anticogging": table, "known_load": None})
     return config.model_copy(update={"controller": controller})
 
 

@@ -15,7 +15,7 @@ from drivers.jit import COMPILED
 from drivers.mapping import MEASURED, RECEIVED, DriveMap, map_of
 from drivers.signal import Signal
 from hil.config.design import Machine, SlowMessage, WireFacts, build
-from hil.config.filtered import refuse_unstable
+from hil.config.filtered import refuse_shaking, refuse_unstable
 from hil.config.reachable import out_of_reach
 from hil.config.showable import check_limits
 from hil.config.tables import RunConfig, load_toml
@@ -132,6 +132,8 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     machine = build(config, wire)
     if config.drive.takes != "voltage":
         refuse_unstable(str(path), config, machine, wire.x_lsb[0])
+    else:
+        refuse_shaking(str(path), config, machine)
     return Setup(path, config, database, binding, wire, machine, out_of_reach(config, wire))
 
 

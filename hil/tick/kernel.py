@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hil.control.cogging import flows, torque_at
+from hil.control.cogging import flows, known_load, loaded
 from hil.control.jit import array_at, jit
 from hil.control.law import (
     LAW_PARAMS,
@@ -80,7 +80,7 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     heard = fresh and math.isfinite(t["w"]) and (not told or math.isfinite(t["i_q"]))
     periods = min(int(t["gap"]), int(lp["max_gap"]) + 1)
     ls["ua"][0] = flowed(lp, ls, t["i_q"] * lp["u_i"], heard and told, periods)
-    if lp["cogs"] and lp["order"]:
+    if loaded(lp) and lp["order"]:
         flows(lp, ls, periods)
     observe(lp, ls, t["w"], 0.0, 0.0, heard, t["gap"])
     if lp["every"] > 1 and not heard:
@@ -167,11 +167,11 @@ def remember(p: Any, s: Any, t: Any) -> None:
 
 @jit
 def report(p: Any, lp: Any, ls: Any, t: Any) -> None:
-    """Write the estimates to the tick; what is known of the load over the angle is part of it."""
+    """Write the estimates to the tick; what is known of the load beforehand is part of it."""
     t["d_hat_w"], t["d_hat_q"], t["d_hat_d"] = ls["d_hat"][0], ls["d_hat"][1], ls["d_hat"][2]
     t["T_L_hat"] = -p["J"] * ls["d_hat"][0] + 0.0
-    if lp["cogs"]:
-        t["T_L_hat"] += torque_at(lp, ls["theta"], ls["x"][0])
+    if loaded(lp):
+        t["T_L_hat"] += known_load(lp, ls, 0.0)
     t["filled"] = ls["filled"]
 
 

@@ -135,8 +135,9 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
             known = known or (_elastic(plant.masses),)
     if known and not more.get("shafts"):
         more |= {"shafts": known, "elastic": takes_voltage(setup)}
-    if (given_shaft := elastic_shaft(setup.config.motor)) is not None and not more.get("shafts"):
-        more["shafts"] = (given_shaft.elastic,)
+    if (given_shaft := elastic_shaft(setup.config.motor)) is not None:
+        more |= {} if more.get("shafts") else {"shafts": (given_shaft.elastic,)}
+        more |= {"known": given_shaft.elastic, "elastic": True} if takes_voltage(setup) else {}
     own = {name: value for name, value in (given or {}).items() if value is not None}
     more |= {} if takes_voltage(setup) else _own_loop(setup, more.get("spread", UNTOLD))
     motor, (w_noise, i_q_noise, i_d_noise) = motor_model(setup.config.motor), noise_of(setup, sensors, own)

@@ -155,7 +155,7 @@ class Loop:
 def loop_of(law: Record, shaft: Plant, T_s: float) -> Loop:
     """Run a law through a shaft's filter and judge it."""
     own, state = law.copy(), new_law_state()
-    own["cogs"] = 0  # known over the angle: no part of the linear loop
+    own["cogs"], own["k_w2"] = 0, 0.0  # a known load: no part of the linear loop
     own["i_max"] = np.inf
     step, pulse = np.empty((2, 4, min(max(round(RESPONSE_S / T_s), 500), 20_000)))
     with np.errstate(over="ignore", invalid="ignore"):

@@ -73,7 +73,8 @@ class Bench:
     ``brake``: the load step acts on the motor, not behind the shaft;
     ``i_d_noise`` is that of i_d with the resolution ``i_d_lsb`` [A] of its frame, which may be coarser than
     i_q's. Of a drive with a current loop of its own (``inner``) u is in its ``unit``, A or N m, and
-    ``filter`` is what its speed really comes through.
+    ``filter`` is what its speed really comes through. ``known``: the shaft that the observer of a drive by
+    voltage has in its model.
     """
 
     motor: MotorModel
@@ -92,6 +93,7 @@ class Bench:
     inner: InnerLoop | None = None
     filter: SpeedFilter | None = None
     unit: str = "V"
+    known: Elastic | None = None
 
     @property
     def every(self) -> int:
@@ -101,7 +103,8 @@ class Bench:
     @property
     def ticks(self) -> int:
         """Length of a response; a loop that measures seldom takes longer to come to rest."""
-        return min(max(round(RESPONSE_S / self.T_s), 200) * min(self.every, 5), 8000)
+        longer = 5 if self.known else min(self.every, 5)  # a shaft rings
+        return min(max(round(RESPONSE_S / self.T_s), 200) * longer, 8000)
 
     def corners(self) -> list[MotorModel]:
         """The motors at the corners of the spread."""
@@ -123,6 +126,7 @@ class Bench:
         Without one on that which the observer knows.
         """
         if self.inner is None:
+            at = at or self.known
             return shaft(motor, self.T_s, *at, self.brake) if at else rigid(motor, self.T_s)
         if at is None and self.inner.shaft is not None:
             at = self.inner.shaft.elastic
@@ -174,9 +178,9 @@ def _state() -> Record:
 
 
 def _free(law: Record) -> Record:
-    """The law without the limit of the current; and what is known over the angle is no part of its loop."""
+    """The law without the limit of the current; and a load that is known is no part of its loop."""
     own = law.copy()
-    own["cogs"], own["i_max"] = 0, np.inf
+    own["cogs"], own["k_w2"], own["i_max"] = 0, 0.0, np.inf
     return own
 
 
@@ -291,6 +295,7 @@ def _coupled_noise(out: Array, bench: Bench) -> tuple[float, float]:
 
 def turning_responses(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, ticks: int) -> Array:
     """u_q, speed, i_d (5, 3, ticks) of :func:`hil.tuning.loop.respond_turning`, at the bench's speed."""
+    at = at or bench.known
     own, plant = _free(law), _turning(motor, bench.T_s, bench.w_0, at)
     out = _buffer((5, 3, ticks))
     with np.errstate(over="ignore", invalid="ignore"):

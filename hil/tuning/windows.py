@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from hil.control.law import LawSpec, exact_after, law_window, sampled_model
+from hil.control.law import LawSpec, design_law, exact_after, law_window, sampled_model
 from hil.control.linalg import Array
 from hil.control.observer import Window, bounds, impulse_response, parabola_weights, response_length
 from hil.tuning.loop import LOAD, PULSE_I, PULSE_W, Record
@@ -47,10 +48,32 @@ def figures(spec: LawSpec, bench: Bench, lsb: Array) -> dict[str, dict[str, floa
         name: _channel(weights[:, c], model, bench, noises, c) | {"lsb_bound": float(limits.resolution[c])}
         for c, name in enumerate(("speed", "current"))
     }
+    if spec.shaft is not None:
+        found["speed"] = _beside_shaft(weights[:, 0], design_law(spec, bench.T_s), bench, lsb)
     for c, own in enumerate(found.values()):
         if window.short.size and window.short[c]:
             own |= _after_a_change(window, model, bench, noises, c)
     return found
+
+
+def _beside_shaft(g: Array, law: Record, bench: Bench, lsb: Array) -> dict[str, float]:
+    """Figures of the speed channel whose innovations rest on the shaft's states as well."""
+    v_y, v_u, v_s = (law[name][0, :4] for name in ("v_y", "v_u", "v_s"))
+    d = np.convolve(v_y, np.diff(law["gap_y"][0, :4], prepend=0.0))[:3]  # weights of d in an innovation
+    by_w, h = np.convolve(g, v_y), np.convolve(g, d)
+    by_i = np.convolve(g, np.convolve(v_u[:3], [0.5, 0.5]) + np.convolve(v_s[:3], [1.0, -1.0]))
+    peak, N = float(np.abs(np.fft.rfft(h, max(4096, len(h)))).max()), exact_after(law)[0]
+    return {
+        "N": N,
+        "D_ms": N * bench.T_s * 1e3,
+        "sigma_d": math.hypot(
+            bench.w_noise * np.linalg.norm(by_w).item(), bench.i_noise * np.linalg.norm(by_i).item()
+        ),
+        "lag_ms": float((h * (np.arange(len(h)) + 0.5)).sum() * bench.T_s * 1e3),
+        "peak_H": peak,
+        "mismatch_allowed": 1.0 / peak,
+        "lsb_bound": float(0.5 * (lsb[0] * np.abs(by_w).sum() + lsb[1] * np.abs(by_i).sum())),
+    }
 
 
 def _after_a_change(window: Window, model: Any, bench: Bench, noises: Array, c: int) -> dict[str, float]:

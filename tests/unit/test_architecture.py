@@ -37,6 +37,7 @@ ROOMS = (
 """The rooms of hil, each of which may import from those before it."""
 UPWARD = {
     ("hil/config/filtered.py", "hil.tuning.current"),  # asked only for a drive with a filter; loads scipy
+    ("hil/config/filtered.py", "hil.tuning.measure"),  # asked only for a shaft that is told; loads scipy
     ("hil/log/writer.py", "hil.replay.snapshot"),  # a process of its own, which follows the ticks
 }
 LOOSE = {"__init__", "cli", "errors", "ports", "signals"}
