@@ -75,6 +75,7 @@ faults: $(STAMP) ## the fault matrix, every row as expected
 	$(BIN)/hil faults configs/faults/odrive.toml
 	$(BIN)/hil faults configs/faults/cia402.toml
 	$(BIN)/hil faults configs/faults/dyno.toml
+	$(BIN)/hil faults configs/faults/dyno-fac.toml
 
 crash: $(STAMP) ## kill every process of a run, again and again (KILLS=200 SEED=1)
 	$(BIN)/python -m tests.crash.kills --kills $(or $(KILLS),200) --seed $(or $(SEED),1)

@@ -112,7 +112,7 @@ class Judged:
             phases=self.phases,
             log=result,
             bus_load=lambda: None,
-            follows=self.config.controller.kind != "torque",
+            follows=self.config.follows_speed,
         )
         found = {figure.key: figure.of(run) for figure in FIGURES} | self._added(self.config.limits)
         limits = wanted(self.config.criteria)

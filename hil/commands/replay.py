@@ -139,16 +139,30 @@ def _fleet(args: argparse.Namespace) -> int:
 
 
 def _what_if(args: argparse.Namespace) -> int:
+    from hil.config.nodefile import load_nodes
     from hil.config.tables import RunConfig, load_toml
+    from hil.errors import HilError
+    from hil.log.info import info_of
     from hil.replay.whatif import what_if
     from hil.report.view import show, what_if_table
 
-    config = load_toml(args.config, RunConfig, [])
+    nodes = load_nodes(args.config)
+    if nodes and args.output:
+        raise HilError(f"{args.config}: has {len(nodes)} nodes, -o takes one's ticks; leave it out")
+    configs = nodes or {"": load_toml(args.config, RunConfig, [])}
     out = output_log(args.output) if args.output else None
-    found = what_if(one_run(args.logs), args.config, config, out)
+    run = one_run(args.logs)
+    first, *_ = [*info_of(run).nodes, ""]
+    found = {
+        name: what_if(run, args.config, config, out, "" if name == first else name)
+        for name, config in configs.items()
+    }
     if args.json:
-        print_json(found.as_dict())
-    else:
-        show(what_if_table(found))
-        say("open loop: the motor answered to the logged commands, not to these")
+        print_json({"nodes": {n: f.as_dict() for n, f in found.items()}} if nodes else found[""].as_dict())
+        return 0
+    for name, one in found.items():
+        if name:
+            say(f"node {name}:")
+        show(what_if_table(one))
+    say("open loop: the motor answered to the logged commands, not to these")
     return 0

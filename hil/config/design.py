@@ -222,9 +222,10 @@ def known_cogging(config: RunConfig) -> Harmonics | None:
     if given is None:
         return None
     motor, where = config.motor, "controller.anticogging"
-    if config.controller.kind == "torque":
+    if not config.follows_speed:
         raise ControlDesignError(
-            f"{where}: the law torque follows no speed and gives what its table says; leave the key out"
+            f"{where}: the law {config.controller.kind} follows no speed, and gives what it is "
+            "commanded; leave the key out"
         )
     named = given.motor and motor.name and given.motor != motor.name
     if named or given.n_p != motor.n_p or abs(given.k_t_n_m_a / config.k_t - 1.0) > OTHER_MOTOR:

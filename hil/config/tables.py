@@ -148,6 +148,23 @@ class RunConfig(Table):
         }
 
     @property
+    def commands_load(self) -> bool:
+        """Whether its drive takes the load machine's torque, too: fac of a drive that takes voltages."""
+        return self.controller.kind == "fac" and self.drive.takes == "voltage"
+
+    @property
+    def paired(self) -> bool:
+        """Whether its law is half of one over two nodes: fac of a drive with its own current loop."""
+        return self.controller.kind == "follow" or (
+            self.controller.kind == "fac" and self.drive.takes != "voltage"
+        )
+
+    @property
+    def follows_speed(self) -> bool:
+        """False for a commanded torque: its speed reference means nothing."""
+        return self.controller.kind not in COMMANDED
+
+    @property
     def command(self) -> Command:
         """What the drive takes, with the limits of it."""
         limits, keys = self.limits, COMMAND_KEYS[self.drive.takes]
@@ -160,6 +177,8 @@ class RunConfig(Table):
         return Command("torque", "N m", most, step, keys)
 
 
+COMMANDED: Final = ("torque", "follow")
+"""Laws that are commanded a torque and follow no speed."""
 COMMAND_KEYS: Final[dict[Takes, tuple[str, str]]] = {
     "voltage": ("u_max_v", "du_max_v"),
     "current": ("i_max_a", "di_max_a"),

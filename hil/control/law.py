@@ -30,7 +30,7 @@ from hil.control.mtpa import POINTS, operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.regen import RegenLimit, braked, regen_params
 from hil.control.registry import Channel, InnerLoop, Plan, Shaft, laws, member, observers
-from hil.control.speed import COMMANDS, ask_speed
+from hil.control.speed import COMMANDS, FOLLOWS, LEADS, ask_speed, share
 from hil.control.speedfilter import (
     PAST,
     ROOM,
@@ -144,6 +144,7 @@ LAW_PARAMS: Final = np.dtype(
         ("i_q_at", "f8", POINTS),
         ("i_d_at", "f8", POINTS),
         ("k_w2", "f8"),
+        ("pair", "i8"),
     ],
     align=True,
 )
@@ -157,7 +158,8 @@ the voltage circle of :func:`mtpa_law`; ``every``: ticks from one measurement to
 several, else 0, and ``span``: what an innovation rests on then, where there is a filter; from ``cogs`` on the
 load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); from ``regen`` on what may go
 back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
-``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed squared."""
+``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed
+squared; ``pair``: a node's part in the law ``fac`` over two nodes (:data:`hil.control.speed.LEADS`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -170,6 +172,7 @@ _COGGING = ("cogs", "cog_order", "cog_a", "cog_b", "cog_lead", "cog_lag", "cog_s
 _REGEN = ("regen", "p_regen", "v_regen", "g_regen")
 _TABLED = ("points", "i_q_at", "i_d_at")
 _QUADRATIC = ("k_w2",)
+_PAIRED = ("pair",)
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
     (
         *_SHAPES,
@@ -183,6 +186,7 @@ LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
         *_REGEN,
         *_TABLED,
         *_QUADRATIC,
+        *_PAIRED,
     ),
     0.0,
 )
@@ -239,6 +243,7 @@ LAW_STATE: Final = np.dtype(
         ("theta", "f8"),
         ("v_dc", "f8"),
         ("asked", "f8"),
+        ("load", "f8"),
     ],
     align=True,
 )
@@ -248,7 +253,8 @@ of a drive's own current loop what flows, and the commands on their way, newest 
 rings of what was reported and what flowed, with their newest place, and how many samples were heard; of an
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
 whether what was asked for was capped; the measured angle of the shaft, where a load over it is known, and the
-measured DC link, where it limits; the torque of a table over k_t [A]."""
+measured DC link, where it limits; the torque of a table over k_t [A]; the torque that a
+load machine was last told to give [N m]."""
 
 Record = npt.NDArray[np.void]
 
@@ -855,6 +861,12 @@ def identify_speed(p: Any, s: Any, w_ref: float) -> None:
 
 
 @jit
+def given_current(p: Any, s: Any, i_q: float) -> float:
+    """A reference current within i_max, and no more than may go back to the DC link."""
+    return fed_back(p, s, min(max(i_q, -p["i_max"]), p["i_max"]))
+
+
+@jit
 def fed_back(p: Any, s: Any, i_q: float) -> float:
     """A row's current, no more than may go back to the DC link."""
     return limited_current(p, s, s["x"][0], i_q) if p["regen"] else i_q
@@ -952,8 +964,14 @@ def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: fl
     if p["kind"] == SPEED and p["rows"] > 0:
         identify_speed(p, s, w_ref)
         return
+    if p["kind"] == SPEED and p["pair"] == FOLLOWS:
+        s["i_q_ref"] = given_current(p, s, i_q_ref)
+        s["u"][0], s["u"][1], s["u"][2] = 0.0, s["i_q_ref"] * p["u_i"], 0.0
+        return
     if p["kind"] == SPEED:
         ask_speed(p, s, w_ref, dw_ref)
+        if p["pair"] == LEADS:
+            share(p, s, given_current(p, s, i_q_ref))
         return
     look_ahead(p, s)
     if p["kind"] == FAC:
@@ -977,4 +995,4 @@ def is_saturated(p: Any, s: Any, u_limit: float) -> bool:
         return True
     if (p["kind"] == MTPA or p["regen"]) and s["capped"] != 0:
         return True
-    return bool(p["kind"] == FAC and abs(s["u"][0]) >= p["T_L_max"])
+    return bool((p["kind"] == FAC or p["pair"] == LEADS) and abs(s["u"][0]) >= p["T_L_max"])

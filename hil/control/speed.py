@@ -20,6 +20,10 @@ from hil.control.speedfilter import enter
 MOST_DELAY: Final = 8
 """Ticks by which a command may act later than with the next latch."""
 COMMANDS: Final = MOST_DELAY + 1
+LEADS: Final = 1
+"""``pair`` of the law fac over two nodes, which commands the load machine, too."""
+FOLLOWS: Final = 2
+"""``pair`` of that load machine."""
 
 
 @jit
@@ -98,8 +102,17 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     wanted = after + holds + p["lam_w"] * (sigma - target - held)
     u = (wanted - a * sigma - drift) / p["g_u"]
     s["i_q_ref"] = min(max(u / p["u_i"], -p["i_max"]), p["i_max"])
-    if p["regen"]:
+    if p["regen"] and p["pair"] == 0:
         s["capped"] = 0
         s["i_q_ref"] = braked(p, s, p["n_p"] * s["x_p"][0], 0.0, s["i_q_ref"])
         u = s["i_q_ref"] * p["u_i"] if s["capped"] else u
     s["u"][0], s["u"][1], s["u"][2] = 0.0, u, 0.0
+
+
+@jit
+def share(p: Any, s: Any, i_q: float) -> None:
+    """The net command of :func:`ask_speed` as (T_L, i_q*): u_net = u - T_L / k_u, T_L = k_u (u - u_net)."""
+    u, net = i_q * p["u_i"], s["u"][1]
+    s["i_q_ref"] = i_q
+    s["u"][0] = min(max(p["k_u"] * (u - net), -p["T_L_max"]), p["T_L_max"])
+    s["u"][1] = u

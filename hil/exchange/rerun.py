@@ -107,7 +107,7 @@ class Run:
         self._setup, self.tape = setup, Tape()
         config = setup.config
         self.shadow, self.roles = config.loop.shadow, roles_of(setup.binding)
-        load = config.controller.kind == "fac"
+        load = config.commands_load
         self._client = drive_kind(config.drive.kind).open(
             self.tape, setup.database, load=load, drive_map=setup.binding.map, now=lambda: 0
         )

@@ -298,7 +298,7 @@ def _judged(row: Row, setup: Setup, name: str, evidence: Evidence) -> Result:
     result, command = Result(row.name, row.expect.text), setup.binding.command
     reader = command.message.reader(*(n for part, n in command.parts if part in (*COMMANDED_Q, *COMMANDED_D)))
     expect = row.expect.of(name) if name else row.expect
-    if setup.config.controller.kind == "torque":  # it follows no speed
+    if not setup.config.follows_speed:  # it follows no speed
         expect = expect.model_copy(update={"w_error_rad_s": math.inf})
     judge(result, expect, evidence, setup.config.command.most, reader, command.message.send_id)
     return result

@@ -47,7 +47,7 @@ def binding_of(log: Log) -> tuple[Binding, RunConfig]:
         raise HilError(f"{error}") from error
     database = Database(Path("drive.dbc"), config.drive.node_id, config.drive.node_rule, text)
     parts = map_of(config.drive.signals, database, "drive.signals", **config.map_facts)
-    return bind(parts, database, load=config.controller.kind == "fac"), config
+    return bind(parts, database, load=config.commands_load), config
 
 
 class FrameCheck:

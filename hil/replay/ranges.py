@@ -12,7 +12,7 @@ from hil.control.law import MTPA, N_MAX, ROWS
 from hil.control.mtpa import POINTS
 from hil.control.observer import ADAPTIVE, FIR, FIR_MAX
 from hil.control.references import TABLE, TABLE_MAX
-from hil.control.speed import MOST_DELAY
+from hil.control.speed import FOLLOWS, MOST_DELAY
 from hil.control.speedfilter import MOST_AVERAGE, PAST, ROOM
 from hil.log.named import Record
 from hil.signals import DriveState
@@ -36,6 +36,7 @@ RANGES: Final[dict[str, dict[str, tuple[int, int]]]] = {
         "span": (0, ROOM),
         "cogs": (0, ORDERS),
         "points": (0, POINTS),
+        "pair": (0, FOLLOWS),
     },
     "reference": {"kind": (0, TABLE), "count": (0, TABLE_MAX)},
     "safety_state": {

@@ -88,7 +88,13 @@ def other_machine(log: Log, config: RunConfig) -> Machine:
         raise HilError(f"{log.path}: was logged at {rate:g} Hz; loop.rate_hz must be the same")
     shadow = config.model_copy(update={"loop": config.loop.model_copy(update={"shadow": True})})
     machine = build(shadow, wire_of_log(log))
-    if FAC in (int(machine.law["kind"][0]), int(machine_of(log).law["kind"][0])):
+    logged_law = machine_of(log).law
+    if int(machine.law["pair"][0]) not in (0, int(logged_law["pair"][0])):
+        raise HilError(
+            f"{log.path}: controller.kind {config.controller.kind}: half of one law over two nodes, and this "
+            "log is of no run under it: it does not say what each told the other"
+        )
+    if FAC in (int(machine.law["kind"][0]), int(logged_law["kind"][0])):
         raise HilError(f"{log.path}: controller.kind fac commands a load torque that no log says was applied")
     return machine.fresh()
 
@@ -136,9 +142,14 @@ def header(log: Log, config: Path, machine: Machine, used: RunConfig) -> dict[st
     return {"metadata": run, "attachments": log.attachments | new}
 
 
-def what_if(source: Source, config_path: Path, config: RunConfig, out: Path | None = None) -> WhatIf:
-    """Run the controller of ``config`` over a log; ``out`` gets the ticks. Raises HilError."""
-    log = new_log(source)
+def what_if(
+    source: Source, config_path: Path, config: RunConfig, out: Path | None = None, node: str = ""
+) -> WhatIf:
+    """Run the controller of ``config`` over a log, of several nodes one's; ``out`` gets its ticks.
+
+    Raises HilError.
+    """
+    log = new_log(source, node)
     if out is not None:
         if out.exists():
             raise HilError(f"{out}: exists already; name another file with -o")

@@ -123,7 +123,7 @@ class Run:
     @property
     def follows(self) -> bool:
         """False for a commanded torque: its speed reference means nothing, so there is no error to show."""
-        return self.config is None or self.config.controller.kind != "torque"
+        return self.config is None or self.config.follows_speed
 
     @property
     def rate_hz(self) -> float:

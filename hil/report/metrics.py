@@ -75,11 +75,17 @@ def find_step(ticks: TickArray, at_least: float = 0.5) -> int | None:
     """
     if len(ticks) < 2:
         return None
-    jump = np.where(ticks["request"][1:] < Request.RAMP_DOWN, np.abs(np.diff(ticks["T_L_true"])), np.nan)
+    jump = np.where(ticks["request"][1:] < Request.RAMP_DOWN, np.abs(np.diff(untold(ticks))), np.nan)
     if not np.isfinite(jump).any():
         return None
     row = int(np.nanargmax(jump)) + 1
     return row if jump[row - 1] >= at_least else None
+
+
+def untold(ticks: TickArray) -> npt.NDArray[np.float64]:
+    """The true load torque [N m] less what the controller is told of a load machine that it commands."""
+    out: npt.NDArray[np.float64] = ticks["T_L_true"] - ticks["T_L_in"]
+    return out
 
 
 def torque(motor: MotorModel, i_q: Any, i_d: Any) -> Any:
@@ -91,7 +97,8 @@ def true_disturbance(ticks: TickArray, believed: MotorModel, true: MotorModel) -
     """d_w [rad/s2] by definition: what the true motor's dw/dt has over the believed model's with c(x)."""
     w, i_q, i_d = ticks["w"], ticks["i_q"], np.nan_to_num(ticks["i_d"])  # not reported: held at zero
     real = (torque(true, i_q, i_d) - ticks["T_L_true"] - true.B_f * w) / true.J
-    out: npt.NDArray[np.float64] = real - (torque(believed, i_q, i_d) - believed.B_f * w) / believed.J
+    told = torque(believed, i_q, i_d) - ticks["T_L_in"] - believed.B_f * w
+    out: npt.NDArray[np.float64] = real - told / believed.J
     return out
 
 
@@ -100,7 +107,8 @@ def load_step(ticks: TickArray, N: int, believed: MotorModel, true: MotorModel) 
     row = find_step(ticks)
     if row is None or row < 50:
         return None
-    settled = row + _moving(ticks["T_L_true"][row - 1 :])
+    load = untold(ticks)
+    settled = row + _moving(load[row - 1 :])
     if settled + N + 1 >= len(ticks):
         return None
     end = _until(ticks, settled)
@@ -108,7 +116,7 @@ def load_step(ticks: TickArray, N: int, believed: MotorModel, true: MotorModel) 
     outside = np.nonzero(np.abs(error) > RECOVERED_RAD_S)[0]
     period_ms = float(np.median(np.diff(ticks["t_ns"][row - 1 : end]))) * 1e-6
     recovery = (int(outside[-1]) + 1) * period_ms if len(outside) else 0.0
-    true_step = -float(ticks["T_L_true"][settled] - ticks["T_L_true"][row - 1]) / true.J
+    true_step = -float(load[settled] - load[row - 1]) / true.J
     d_w = true_disturbance(ticks[settled + N - 1 : settled + N + 1], believed, true)
     estimate_error = abs(float(ticks["d_hat_w"][settled + N]) - float(d_w[0]))
     return LoadStep(int(ticks["k"][row]), float(np.abs(error).max()), recovery, estimate_error, true_step)
@@ -123,7 +131,7 @@ def _moving(torque_n_m: npt.NDArray[np.float64]) -> int:
 
 def _until(ticks: TickArray, row: int) -> int:
     """First row after ``row`` at which the load or the reference changes again."""
-    load = np.abs(np.diff(ticks["T_L_true"][row:])) > CHANGED_N_M
+    load = np.abs(np.diff(untold(ticks[row:]))) > CHANGED_N_M
     moving = np.abs(ticks["dw_ref"][row + 1 :]) > 0
     changed = np.nonzero(load | moving | (ticks["state"][row + 1 :] != ticks["state"][row]))[0]
     return row + 1 + int(changed[0]) if len(changed) else len(ticks)

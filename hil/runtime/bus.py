@@ -127,7 +127,7 @@ def new_client(
     controls: bool = False,
 ) -> BusDrive:
     """A drive client on a link of its own; one that ``controls`` may have SYNC by the kernel."""
-    load = setup.config.controller.kind == "fac"
+    load = setup.config.commands_load
     return drive_kind(setup.config.drive.kind).open(
         opened_link(setup),
         setup.database,

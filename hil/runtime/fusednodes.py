@@ -31,6 +31,7 @@ from drivers.posix import (
     now_ns,
 )
 from drivers.wire import STATE
+from hil.control.law import LAW_PARAMS
 from hil.log.push import NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.runtime.fused import (
@@ -89,12 +90,14 @@ from hil.runtime.loop import (
 from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
 from hil.runtime.trouble import TROUBLE
 from hil.signals import TICK
-from hil.tick.kernel import whole_at
+from hil.tick.kernel import PLACED, whole_at
+from hil.tick.pair import ask, leads, tell
 
 NODE_ROWS: Final = ROWS + 1
 KEPT: Final = ROWS
 """Behind a node's table: the places of its controller's states, then of what is kept of them."""
 ADDRESS, LENGTH = 0, 1
+LAW_AT: Final = PLACED.index(LAW_PARAMS)
 QUIET, STOPPED, ENDS = ALONE
 CALM, NEW, OTHERS = range(3)
 U1: Final = np.dtype(np.uint8)
@@ -247,10 +250,38 @@ def keep(table: Any) -> None:
 
 
 @jit
+def ticks_at(nodes: Any, i: int) -> Any:
+    """A node's record."""
+    return array_at(places_at(nodes, i), TICK_AT, TICK)
+
+
+@jit
+def law_at(nodes: Any, i: int) -> Any:
+    """A node's law."""
+    return array_at(places_at(places_at(nodes, i), LAW), LAW_AT, LAW_PARAMS)
+
+
+@jit
+def lead_of(nodes: Any) -> Any:
+    """The node whose law commands the other one, too; -1: none."""
+    for i in range(len(nodes)):
+        if leads(law_at(nodes, i)):
+            return i
+    return -1
+
+
+@jit
 def decide(nodes: Any) -> Any:
     """Each node's controller: OTHERS when those must stop with one, NEW when there is something to log."""
     found, left, going = CALM, False, False
-    for i in range(len(nodes)):
+    lead = lead_of(nodes)
+    first, load = max(lead, 0), 1 - lead
+    for n in range(len(nodes)):
+        i = (first + n) % len(nodes)
+        if lead >= 0 and n == 0:
+            tell(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
+        elif lead >= 0:
+            ask(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
         table = places_at(nodes, i)
         ticks = array_at(table, TICK_AT, TICK)
         state, before = ticks[0]["state"], ticks[0]["reason"]

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from hil.config.design import Machine
+from hil.config.tables import COMMANDED
 from hil.errors import HilError
 from hil.runtime.clock import RealClock
 from hil.signals import DriveState, Request
@@ -78,7 +79,7 @@ def _check(number: int, has: int, w: int, i_q: int, node: int) -> int:
 
 def ranges(machine: Machine, law: str) -> Takes:
     """What a law takes, by name: least, most, rate [SI]; nothing for a commanded torque, which has no w*."""
-    if law == "torque":
+    if law in COMMANDED:
         return {}
     p = machine.setpoint[0]
     found = {"w": (float(p["w_min"]), float(p["w_max"]), float(p["w_rate"]))}

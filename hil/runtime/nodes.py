@@ -39,6 +39,7 @@ from hil.runtime.loop import (
 )
 from hil.runtime.trouble import TROUBLE, Trouble
 from hil.signals import ALL_MISSING, DriveState, Reason, Request, TickArray, cell, ticks_from
+from hil.tick.pair import ask, leads, tell
 
 COUNTERS: Final = GUARD_NS + 1
 """Word of the first node's newest command counter; those of the others follow."""
@@ -220,6 +221,7 @@ class NodesLoop(Loop):
         self._axes, self._more, self._rings = axes, axes[1:], recorder
         self._words: Any = words.cells if words else None
         self._together, first = Together(axes, self._words), axes[0]
+        self._lead = next((axis for axis in axes if leads(axis.machine.law)), None)
         super().__init__(
             self._together, clock, recorder, first.step, first.ticks, plan, request, whole, inbox
         )
@@ -249,12 +251,22 @@ class NodesLoop(Loop):
         for axis in self._axes:
             axis.cells.rx_flags[0] |= guarded
             axis.cells.received_ns[0] = received_ns
-        left = [axis.decide() for axis in self._axes]
-        self._pace[DID] = LEFT if any(left) else 0
+        self._pace[DID] = LEFT if self._decided() else 0
         self._computed(deadline_ns)
         self._answer(tick, deadline_ns)
         self._note(k, deadline_ns)
         return k
+
+    def _decided(self) -> bool:
+        """Each node's controller, one that commands the other first; True when all must stop with one."""
+        if self._lead is None:
+            left = [axis.decide() for axis in self._axes]
+            return any(left)
+        lead, (load,) = self._lead, [axis for axis in self._axes if axis is not self._lead]
+        tell(lead.ticks, load.ticks, load.machine.law)
+        leaves = lead.decide()
+        ask(lead.ticks, load.ticks, load.machine.law)
+        return load.decide() or leaves
 
     def _computed(self, deadline_ns: int) -> None:
         """Once one has left by a fault or a quick stop, all stop in this tick; then the laws have run."""

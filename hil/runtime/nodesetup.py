@@ -7,6 +7,7 @@ from pathlib import Path
 
 from drivers.busload import message_rates, message_shares
 from drivers.hub import heard_ids
+from hil.config.design import inner_loop
 from hil.config.nodefile import load_nodes
 from hil.errors import ArmingError, ConfigError
 from hil.runtime.bus import is_emulated_bus
@@ -28,7 +29,7 @@ def load_node_setups(path: Path, overrides: Overrides) -> Nodes | None:
             setups[name] = setup_of(path, config)
         except ConfigError as error:
             raise ConfigError(f"{path}: node {name}", error.problems) from error
-    if problems := [*_unfit(setups), *_same(setups)]:
+    if problems := [*_unfit(setups), *_same(setups), *_pair(setups)]:
         raise ConfigError(str(path), problems)
     return setups
 
@@ -72,6 +73,47 @@ def _same(setups: Nodes) -> list[str]:
         problems.append(
             f"drive.node_id: {one} ({a.config.drive.node_id}) and {other} ({b.config.drive.node_id}) have "
             f"the same frames ({frames}); give each node its own number"
+        )
+    return problems
+
+
+def _pair(setups: Nodes) -> list[str]:
+    """What one law over both nodes needs of them: fac on the drive under test, follow on the load machine."""
+    kinds = {name: setup.config.controller.kind for name, setup in setups.items() if setup.config.paired}
+    if not kinds:
+        return []
+    if sorted(kinds.values()) != ["fac", "follow"]:
+        return [
+            f"controller.kind: {' and '.join(f'{name} {kind}' for name, kind in kinds.items())}; one law "
+            "over both is fac on the drive under test and follow on the load machine"
+        ]
+    (test,) = (one for one in setups.values() if one.config.controller.kind == "fac")
+    name, load = next((name, one) for name, one in setups.items() if one is not test)
+    config, most = test.config, test.config.limits.T_L_max_n_m
+    problems = []
+    for key in ("current_lag_ms", "delay_ticks"):
+        ours, theirs = (getattr(one.config.drive, key) for one in (test, load))
+        if ours != theirs:
+            problems.append(
+                f"drive.{key}: {ours:g} and {theirs:g}; the law fac moves both drives as one: give both the "
+                "slower one's, or set the faster one's current loop to it"
+            )
+    if "i_q" not in load.wire.measured:
+        problems.append(
+            f"{name}: reports neither i_q nor torque, which fac is told; map one in drive.signals"
+        )
+    inner = inner_loop(load.config)
+    assert inner is not None  # noqa: S101 - of a law that takes no voltages
+    reach = min(load.config.k_t * load.config.limits.i_max_a, inner.k_u * load.config.command.most)
+    if not 0.0 < most <= reach * (1 + 1e-9):
+        problems.append(
+            f"limits.T_L_max_n_m = {most:g} of the law fac: must be positive and within what the limits of "
+            f"{name} allow, {reach:.4g} N m"
+        )
+    if config.motor.J_kg_m2 != load.config.motor.J_kg_m2:
+        problems.append(
+            f"motor.J_kg_m2: {config.motor.J_kg_m2:g} and {load.config.motor.J_kg_m2:g}; both are on one "
+            "shaft, and each torque accelerates the whole of it: give both its inertia"
         )
     return problems
 

@@ -84,7 +84,7 @@ class RunResult:
 def compile_kernels(setup: Setup) -> None:
     """Compile, or load, what a run needs: that takes longer than anything later waits for."""
     setup.machine.looped()
-    fac = setup.config.controller.kind == "fac"
+    fac = setup.config.commands_load
     opens = drive_kind(setup.config.drive.kind).open
     precompile(setup.database, setup.binding.map, fac, new_ticks()[0], opens)
     fused.load()

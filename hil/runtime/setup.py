@@ -107,13 +107,22 @@ def slow_messages(binding: Binding) -> tuple[SlowMessage, ...]:
 
 def load_setup(path: Path, overrides: Overrides) -> Setup:
     """Load and check everything of a run without opening or sending anything."""
-    return setup_of(path, load_toml(path, RunConfig, overrides.as_settings()))
+    config = load_toml(path, RunConfig, overrides.as_settings())
+    if config.paired:
+        raise ConfigError(
+            str(path),
+            [
+                f"controller.kind {config.controller.kind}: half of one law over two nodes, and this takes "
+                "one drive; hil run, check and demo take both, without --set node"
+            ],
+        )
+    return setup_of(path, config)
 
 
 def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Database) -> Setup:
     """:func:`load_setup` for a configuration that is loaded; ``read`` makes a file's database."""
     database = read(path.parent / config.drive.dbc, config.drive.node_id, config.drive.node_rule)
-    load = config.controller.kind == "fac"
+    load = config.commands_load
     parts = drive_map(config, database, str(path))
     asked = parts.sync or parts.poll  # then it answers as often as that
     period_ms = None if asked else config.feedback_every * config.loop.period_ns * 1e-6

@@ -148,7 +148,7 @@ def check_spoken(path: Path, config: RunConfig, spoken: dict[int, int]) -> None:
     """
     drive = config.drive
     database = Database(path.parent / drive.dbc, drive.node_id, drive.node_rule)
-    made = bind(drive_map(config, database, str(path)), database, load=config.controller.kind == "fac")
+    made = bind(drive_map(config, database, str(path)), database, load=config.commands_load)
     needed = [b.message for b in made.incoming if {part for part, _ in b.parts} & set(MEASURED)]
     strange = [
         f"{message.name} (0x{message.can_id:X}, {message.length} bytes)"

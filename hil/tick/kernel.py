@@ -28,7 +28,7 @@ from hil.control.law import (
     to_circle,
 )
 from hil.control.references import REFERENCE
-from hil.control.speed import flowed, latched
+from hil.control.speed import LEADS, flowed, latched
 from hil.signals import Controlword, DriveState, GuardFlag, Reason, RxFlag
 from hil.tick.guard import SAFETY_PARAMS, SAFETY_STATE, guard_command, voltage_limit
 from hil.tick.setpoint import SETPOINT_PARAMS, SETPOINT_STATE, prepare
@@ -74,12 +74,23 @@ def applied_now(p: Any, s: Any, t: Any) -> None:
 
 @jit
 def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
-    """:func:`estimate` of a drive with a current loop: told what flowed, or by the model of that loop."""
+    """:func:`estimate` of a drive with a current loop: told what flowed, or by the model of that loop.
+
+    Of the law fac over two nodes it is what flowed of both: i_q less the load machine's torque over k_t.
+    """
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
-    told = lp["told"] != 0
+    told, pair = lp["told"] != 0, lp["pair"] == LEADS
     heard = fresh and math.isfinite(t["w"]) and (not told or math.isfinite(t["i_q"]))
+    flows_now, braking = t["i_q"] * lp["u_i"], 0.0
+    if pair:
+        heard = heard and math.isfinite(t["T_L_in"])
+        flows_now -= t["T_L_in"] / lp["k_u"]
+        braking = ls["load"]
+        if heard:
+            ls["load"] = t["T_L_in"]
+            braking = 0.5 * (braking + ls["load"])
     periods = min(int(t["gap"]), int(lp["max_gap"]) + 1)
-    ls["ua"][0] = flowed(lp, ls, t["i_q"] * lp["u_i"], heard and told, periods)
+    ls["ua"][0] = flowed(lp, ls, flows_now, heard and told, periods)
     if loaded(lp) and lp["order"]:
         flows(lp, ls, periods)
     observe(lp, ls, t["w"], 0.0, 0.0, heard, t["gap"])
@@ -87,6 +98,10 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
         between(lp, ls)
     t["ua_q"], t["ua_d"] = ls["ua"][0], 0.0
     applied_now(p, s, t)
+    if pair:
+        t["ua_q"] += braking / lp["k_u"]
+        latched(lp, ls, s["ua_q"] - t["T_L_sent"] / lp["k_u"], True)
+        return
     latched(lp, ls, s["ua_q"], not fresh or t["drive_state"] == DriveState.OPERATION_ENABLED)
 
 
@@ -167,11 +182,13 @@ def remember(p: Any, s: Any, t: Any) -> None:
 
 @jit
 def report(p: Any, lp: Any, ls: Any, t: Any) -> None:
-    """Write the estimates to the tick; what is known of the load beforehand is part of it."""
+    """Write the estimates to the tick; what is known of the load, or told, is part of it."""
     t["d_hat_w"], t["d_hat_q"], t["d_hat_d"] = ls["d_hat"][0], ls["d_hat"][1], ls["d_hat"][2]
     t["T_L_hat"] = -p["J"] * ls["d_hat"][0] + 0.0
     if loaded(lp):
         t["T_L_hat"] += known_load(lp, ls, 0.0)
+    if lp["pair"] == LEADS:
+        t["T_L_hat"] += ls["load"]
     t["filled"] = ls["filled"]
 
 

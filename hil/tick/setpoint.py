@@ -15,6 +15,7 @@ import numpy.typing as npt
 from hil.control.jit import jit
 from hil.control.law import FAC
 from hil.control.references import reference_at
+from hil.control.speed import FOLLOWS, LEADS
 from hil.signals import DriveState, Request
 
 SETPOINT_PARAMS: Final = np.dtype(
@@ -112,7 +113,8 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
     """
     t, s, p, g = ticks[0], ss[0], gp[0], gs[0]
     w_ref, dw_ref = reference_at(rp[0], s["run_ticks"] * lp[0]["T_s"])
-    i_q = rp[0]["i_q"] if lp[0]["kind"] == FAC else 0.0
+    pair = lp[0]["pair"]
+    i_q = rp[0]["i_q"] if lp[0]["kind"] == FAC or pair == LEADS else 0.0
     w_ref, dw_ref, i_q = follow(p, g, w_ref, dw_ref, i_q, t["gap"])
     orderly = t["request"] == Request.STOP and s["state"] == DriveState.OPERATION_ENABLED
     if g["ramping"]:
@@ -125,7 +127,9 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
         if orderly and not over:
             t["request"] = Request.RAMP_DOWN.value
     g["w"], g["i_q"] = w_ref, i_q
-    t["w_ref"], t["dw_ref"], t["i_q_ref_in"] = w_ref, dw_ref, i_q
+    t["w_ref"], t["dw_ref"] = w_ref, dw_ref
+    if pair != FOLLOWS:  # else another node's law has written it
+        t["i_q_ref_in"] = i_q
 
 
 def no_setpoint() -> Record:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from drivers.bus import SocketLink
@@ -249,11 +250,11 @@ class Ran:
         return open_log(self.path, node=node)
 
 
-def run(path: Path, case: str, compiled: bool) -> Ran:
+def run(path: Path, case: str, compiled: bool, config: str = "dyno.toml") -> Ran:
     """A run of the loop of two nodes, for a process of virtual time, which it begins anew."""
     TIME.restart()
     settings = ("feedback.hold_ticks=40", "drive.0.reference.w_rad_s=0.0")
-    setups = load_node_setups(CONFIGS / "dyno.toml", Overrides(settings=settings))
+    setups = load_node_setups(CONFIGS / config, Overrides(settings=settings))
     assert setups is not None
     stages: Counter[int] = Counter()
     together: list[int] = []
@@ -387,3 +388,24 @@ def test_a_compiled_tick_of_two_nodes_is_the_loops_own(
             (log.ticks["rx_flags"] & int(RxFlag.FRESH) != 0) for log in map(compiled.log, ("motor", "load"))
         ]
         assert fresh[0].all() and (~fresh[1]).sum() == 3
+
+
+PAIRED = ("calm", "no feedback of the motor", "no feedback of the load", "late feedback of the load",
+          "motor's error", "the load's fault", "gone before the commands", "a stop")  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PAIRED)
+def test_so_is_one_law_over_both(case: str, elsewhere: ProcessPoolExecutor, tmp_path: Path) -> None:
+    """What each node is told by the other stands in its record, whichever computed it."""
+    _, left, ended = CASES[case]
+    rules, compiled = (
+        elsewhere.submit(run, tmp_path / f"{form}.mcap", case, form, "dyno-fac.toml").result()
+        for form in (False, True)
+    )
+    assert_same(rules, compiled)
+    assert compiled.ended == ended and set(compiled.stages) - {RECORDED} <= left, compiled.stages
+    motor, load = (compiled.log(node).ticks for node in ("motor", "load"))
+    heard = load["rx_flags"] & int(RxFlag.FRESH) != 0
+    assert (np.isnan(motor["T_L_in"]) == ~heard).all() and np.abs(motor["T_L"]).max() > 0.1
+    going = motor["reason"] == 0  # a motor that must stop with the load has computed once more
+    assert np.array_equal(load["i_q_ref_in"][going], 0.0 - motor["T_L"][going] / 3.6)

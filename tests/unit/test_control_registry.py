@@ -80,8 +80,8 @@ def params(*more: str) -> Any:
 
 def test_every_member_is_tried_here() -> None:
     assert set(OBSERVERS) == set(observers())
-    # identify: tests/unit/test_identify*; torque closes no loop: tests/unit/test_nodes.py
-    assert set(LAWS) | {"fac", "identify", "torque"} == set(laws())
+    # identify: tests/unit/test_identify*; torque, follow close no loop: tests/unit/test_nodes.py
+    assert set(LAWS) | {"fac", "follow", "identify", "torque"} == set(laws())
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 from drivers.bus import BusSettings, Frame, SocketLink, open_link
 from drivers.errors import LinkError
@@ -23,6 +24,7 @@ from firmware_model.registry import PlantError
 from firmware_model.shaft import advance_both, couple, refuse_uncoupled
 from hil.config.nodefile import load_nodes
 from hil.config.tables import RunConfig, load_toml
+from hil.control.errors import ControlDesignError
 from hil.control.law import ask, new_law_state
 from hil.errors import ConfigError
 from hil.log.mcapfile import RunFile
@@ -30,11 +32,14 @@ from hil.log.reader import open_log
 from hil.runtime.nodes import Together
 from hil.runtime.nodesetup import load_node_setups, nodes_load
 from hil.runtime.setup import Overrides, load_setup
-from hil.signals import new_ticks
+from hil.signals import DriveState, RxFlag, new_ticks
 from hil.sim.emulate import make_bench
+from hil.tick.pair import ask as ask_load
+from hil.tick.pair import tell
 from tests.conftest import CONFIGS
 
 DYNO = CONFIGS / "dyno.toml"
+FAC = CONFIGS / "dyno-fac.toml"
 WIRE = Wire(0.0, 1e9, 0.0, 1e9, 0.0, 1e9)
 
 
@@ -88,6 +93,79 @@ def test_what_is_refused_is_said_in_one_line(setting: str, said: str) -> None:
     with pytest.raises(Exception, match=said) as caught:
         setups_of(setting)
     assert "\n" not in str(caught.value) or "kind" in setting or "period" in setting, str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ('drive.1.controller={kind="torque", torque_n_m=[0.0], for_s=[1.0]}',
+         "controller.kind: motor fac; one law over both is fac on the drive under test and follow on"),
+        ('drive.0.controller={kind="follow"}', "controller.kind: motor follow and load follow; one law over"),
+        ("drive.1.current_lag_ms=2.0", "drive.current_lag_ms: 1 and 2; the law fac moves both drives as one"),
+        ("drive.0.delay_ticks=1", "drive.delay_ticks: 1 and 0; the law fac moves both drives as one"),
+        ("drive.0.limits.T_L_max_n_m=0.0", "limits.T_L_max_n_m = 0 of the law fac: must be positive and"),
+        ("drive.1.limits.i_max_a=4.0", "limits.T_L_max_n_m = 18 of .* the limits of load allow, 14.4 N m"),
+        ('drive.1.signals.torque=""', "load: reports neither i_q nor torque, which fac is told"),
+        ('drive.0.signals.torque=""', "controller.kind fac: the drive reports neither i_q nor torque"),
+        ("drive.0.motor={R_s_ohm=2.875, L_d_h=0.033, L_q_h=0.033, psi_f_wb=0.8, n_p=3, J_kg_m2=0.011, "
+         "B_f_n_m_s=2e-4}", "motor.J_kg_m2: 0.011 and 0.022; both are on one shaft"),
+        ("motor.shaft={resonance_hz=90.0, damping_ratio=0.02, inertia_ratio=1.0}",
+         "motor.shaft: the law fac commands the load itself, without a shaft in its model"),
+    ],
+)  # fmt: skip
+def test_what_one_law_over_both_needs_is_said(setting: str, said: str) -> None:
+    with pytest.raises((ConfigError, ControlDesignError), match=said) as caught:
+        load_node_setups(FAC, Overrides(settings=(setting,)))
+    assert len(str(caught.value).splitlines()) <= 2, str(caught.value)
+
+
+@pytest.mark.parametrize("node", ["motor", "load"])
+def test_half_of_a_law_is_none_for_one_drive(node: str) -> None:
+    with pytest.raises(ConfigError, match="half of one law over two nodes, and this takes one drive"):
+        load_setup(FAC, Overrides(settings=(f'node="{node}"',)))
+
+
+def test_two_drives_are_one_to_the_law_over_both() -> None:
+    """Exact drives with lag on one shaft: an unknown load is known, w* is held but for the steps of the wire.
+
+    The plant here is scipy's exponential of (w, i_motor, i_load), which shares nothing with the kernels.
+    """
+    ramp = 'drive.0.reference={kind="ramp", w_rad_s=40.0, rate_rad_s2=400.0, at_s=0.05, i_q_a=1.5}'
+    setups = load_node_setups(FAC, Overrides(settings=(ramp,)))
+    assert setups is not None
+    machines = [one.machine.fresh() for one in setups.values()]
+    J, B, k_t, tau, T_s = 0.022, 4e-4, 3.6, 1e-3, 1e-3
+    A = np.array([[-B / J, k_t / J, k_t / J], [0.0, -1.0 / tau, 0.0], [0.0, 0.0, -1.0 / tau]])
+    held = np.zeros((6, 6))
+    held[:3, :3], held[:3, 3:] = A * T_s, np.diag([-1.0 / J, 1.0 / tau, 1.0 / tau]) * T_s
+    Ad, Bd = (expm(held)[:3, part] for part in (slice(3), slice(3, 6)))
+    ticks, x, commands = [new_ticks() for _ in machines], np.zeros(3), np.zeros(2)
+    for machine in machines:
+        machine.law_state["started"] = 0
+    errors, known = [], []
+    for k in range(1500):
+        load_torque = 0.0 if k < 700 else 5.4
+        for tick, machine, i in zip(ticks, machines, x[1:], strict=True):
+            t = tick[0]
+            t["rx_flags"], t["gap"], t["missing"] = int(RxFlag.FRESH), 1, 0
+            t["drive_state"], t["w"], t["i_q"] = int(DriveState.OPERATION_ENABLED), x[0], i
+            t["echo"] = t["counter"]
+            machine.safety_state["state"] = int(DriveState.OPERATION_ENABLED)
+        motor, load = ticks
+        tell(motor, load, machines[1].law)
+        for tick, machine in zip(ticks, machines, strict=True):
+            if tick is load:
+                ask_load(motor, load, machines[1].law)
+            machine.prepare(tick)
+            machine.step(tick)
+        x = Ad @ x + Bd @ np.array([load_torque, *commands])
+        commands = np.array([tick["u_q"][0] / k_t for tick in ticks])
+        errors.append(x[0] - motor["w_ref"][0])
+        known.append(-J * motor["d_hat_w"][0])
+    assert {int(tick["reason"][0]) for tick in ticks} == {0}
+    assert known[690] == pytest.approx(0.0, abs=1e-3) and known[1490] == pytest.approx(5.4, abs=1e-3)
+    assert abs(errors[1490]) < 6e-3, "what two steps of the wire, 0.01 and 0.007 N m, move"
+    assert max(map(abs, errors[705:715])) > 0.5 and max(map(abs, errors[780:])) < 0.02
 
 
 @pytest.mark.parametrize(("count", "said"), [(1, "not of 1"), (3, "not of 3")])
