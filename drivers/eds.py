@@ -108,7 +108,12 @@ class Dictionary:
         return found
 
     def configured(self) -> Iterator[tuple[Place, int, int]]:
-        """(place, value, bytes) of each number that a DCF sets, but for PDOs: those come from the mode."""
+        """(place, value, bytes) of each number that a DCF sets, but for PDOs: those come from the mode.
+
+        Nothing of an EDS: where one has such values they are of the node that its maker took them from.
+        """
+        if self.path.suffix.lower() != ".dcf":
+            return
         for index in self._objects:
             found = self._objects[index]
             for one in [found] if isinstance(found, ODVariable) else found.values():

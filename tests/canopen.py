@@ -27,6 +27,8 @@ OWN = ("tpdo", "rpdo_timeout_ms", "load_true", "[drive.signals.units]")
 PATIENT = "canopen.answer_timeout_s=5.0"
 """A busy machine lets a thread wait."""
 EDS = CONFIGS / "drives" / "cia402.eds"
+E35 = ROOT / "tests" / "data" / "e35.eds"
+"""Of a servo's maker, with values of its node 32: examples/eds of canopen's source package."""
 
 
 def bus_of(channel: str) -> BusSettings:

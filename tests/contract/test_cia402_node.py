@@ -19,7 +19,7 @@ from drivers.codec import Database
 from firmware_model.config import PlantConfig, build_params
 from firmware_model.node import Node, wire_of
 from hil.config.tables import load_toml
-from tests.canopen import EDS, NODE, emulated
+from tests.canopen import E35, EDS, NODE, emulated
 from tests.contract.test_drive_firmware import Wires
 
 pytestmark = pytest.mark.alone
@@ -242,18 +242,19 @@ def test_two_runs_are_the_same_to_the_bit(configs: Path) -> None:
 
 
 @pytest.fixture
-def judge(configs: Path, channel: str) -> Iterator[BaseNode402]:
-    """Strangers' view of the emulated drive, over a bus."""
+def judge(request: pytest.FixtureRequest, configs: Path, channel: str) -> Iterator[BaseNode402]:
+    """Strangers' view of the emulated drive, over a bus, by an EDS."""
     network = canopen.Network()
     with emulated(configs, channel):
         network.connect(interface="hil-local", channel=channel)
-        node = network.add_node(BaseNode402(NODE, str(EDS)))
+        node = network.add_node(BaseNode402(NODE, str(getattr(request, "param", EDS))))
         try:
             yield node
         finally:
             network.disconnect()
 
 
+@pytest.mark.parametrize("judge", [EDS, E35], indirect=True, ids=["ours", "whole"])
 def test_a_strangers_state_machine_walks_it(judge: BaseNode402) -> None:
     """By SDO, unmapped: each state is reached, and read back, by canopen's own table of CiA 402."""
     assert judge.state == "SWITCH ON DISABLED"
