@@ -16,7 +16,8 @@ from drivers.port import Saved
 from drivers.watch import CommandWatch
 from hil.exchange.periods import MOST_NS, Grid, Heard, Period, Roles, around
 from hil.exchange.readers.recorded import ID_MASK
-from hil.runtime.loop import COUNTER_JUMP, ENDED, missed
+from hil.runtime.loop import ENDED
+from hil.runtime.rules import COUNTER_JUMP, missed
 from hil.runtime.setup import Setup
 from hil.runtime.shadow import ShadowDrive
 from hil.signals import ALL_MISSING, Request, RxFlag, new_ticks

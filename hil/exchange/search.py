@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from hil.errors import HilError
 from hil.exchange.periods import Period, with_ahead
 from hil.exchange.rerun import Before, Run
-from hil.runtime.loop import COUNTER_JUMP
+from hil.runtime.rules import COUNTER_JUMP
 from hil.signals import Request, RxFlag, TickArray, ticks_from
 
 WINDOW: Final = 300

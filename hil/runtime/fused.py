@@ -2,7 +2,7 @@
 
 Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
 long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
-ports. It has no rules of its own: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
+ports. Its rules are those of :mod:`hil.runtime.rules`: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
 guard :func:`hil.tick.kernel.whole_at`; the command :func:`drivers.posix.command`; the records
 :func:`hil.log.push.push`; the guardian's words as :class:`hil.runtime.guardian.GuardedDrive` keeps them.
 At the first thing that is unusual it returns the stage that it reached, and the loop does the rest. Some
@@ -50,16 +50,15 @@ from hil.log.push import HEADER, NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.log.ring import FAILED_AT
 from hil.runtime.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
-from hil.runtime.loop import (
+from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, wait_ns
+from hil.runtime.rules import (
     ARRIVED,
     BEGUN,
     COUNTER_JUMP,
     DECIDED,
     DID,
-    FRESH,
     HEARD,
     LOST,
-    MAX_NS,
     NEVER,
     NEXT,
     NOT_BEGUN,
@@ -68,18 +67,17 @@ from hil.runtime.loop import (
     RECORDED,
     SENT,
     STEER_EVERY,
-    STOP,
     Pace,
-    Plan,
-    StopRequest,
-    Whole,
+    asked_in,
+    begin,
+    bounded,
+    count,
     is_due,
-    missed,
-    none_compiled,
-    wait_ns,
+    is_news,
+    stamp,
+    wake,
 )
-from hil.runtime.trouble import TROUBLE
-from hil.signals import ALL_MISSING, TICK, TickArray
+from hil.signals import TICK, TickArray
 from hil.tick.kernel import whole_at
 
 PHASES: Final = (
@@ -232,15 +230,7 @@ def sleep_until(deadline_ns: int, times: Any) -> Any:
 @jit
 def since(deadline_ns: int, times: Any) -> Any:
     """Time after the deadline, as the record holds it."""
-    return min(now_ns(times) - deadline_ns, MAX_NS)
-
-
-@jit
-def stamp(t: Any, k: int, deadline_ns: int, woken_ns: int, asked: int, log_failed: bool) -> None:
-    """The fields of a tick that is neither late nor the first after others that were skipped."""
-    t["k"], t["t_ns"], t["lateness_ns"] = k, deadline_ns, woken_ns - deadline_ns
-    t["gap"], t["skipped"], t["rx_flags"], t["missing"] = 1, 0, 0, ALL_MISSING
-    t["request"], t["log_failed"] = asked, log_failed
+    return bounded(now_ns(times) - deadline_ns)
 
 
 @jit
@@ -294,7 +284,7 @@ def hand_on(table: Any) -> None:
 
 @jit
 def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
-    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.loop` that it reached."""
+    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.rules` that it reached."""
     times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
     mark(marks, LOOP, times)
     woken_ns = sleep_until(deadline_ns, times)
@@ -305,10 +295,10 @@ def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
         return NOT_BEGUN
     ticks = array_at(table, TICK_AT, TICK)
     t = ticks[0]
-    request = t["request"]
-    due = is_due(array_at(table, PACE, I8), t["rx_flags"] & np.uint32(FRESH), t["gap"], plan[EVERY])
-    stamp(t, k, deadline_ns, woken_ns, asked, log_failed)
-    stage = read(table, t, deadline_ns, due)
+    request, pace = t["request"], array_at(table, PACE, I8)
+    stamp(t, k, deadline_ns, 1, late_ns)
+    begin(t, asked, log_failed)
+    stage = read(table, t, deadline_ns, is_due(pace, plan[EVERY]))
     mark(marks, READ, times)
     if stage < DECIDED:
         return stage
@@ -330,8 +320,9 @@ def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
     t["sent_ns"] = since(deadline_ns, times)
     mark(marks, SEND, times)
     hand_on(table)
-    if t["rx_flags"] & TROUBLE != 0 or t["reason"] != 0 or t["state"] != state or t["request"] != request:
+    if is_news(t, state, request):
         return SENT
+    count(array_at(table, PACE, I8), t)
     push(places_at(table, TICKS_IN), 1)
     t["recorded_ns"] = since(deadline_ns, times)
     mark(marks, RECORD, times)
@@ -339,23 +330,16 @@ def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
 
 
 @jit
-def heard(table: Any, t: Any, k: int, deadline_ns: int, asked: int, count: int) -> Any:
-    """Stamp a tick that feedback woke as the loop in Python does; return its deadline, maybe a later one."""
-    plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
-    now, period_ns = now_ns(array_at(table, TIMES_AT, I8)), plan[PERIOD_NS]
-    jumped, ear = int(t["rx_flags"] & np.uint32(COUNTER_JUMP)), array_at(places_at(table, RECEIVE), EAR, I8)
+def heard(table: Any, t: Any, came: int) -> None:
+    """Stamp a tick that feedback, or SYNC of the kernel's, woke."""
+    times, pace, plan = array_at(table, TIMES_AT, I8), array_at(table, PACE, I8), array_at(table, PLAN, I8)
+    ear = array_at(places_at(table, RECEIVE), EAR, I8)
+    now, jumped = now_ns(times), t["rx_flags"] & COUNTER_JUMP
     if len(ear) > 0:
-        count, jumped, ear[SYNCED] = ear[SYNCED], 0, 0
-        now = ear[STAMP] if count > 0 else now
-    late_ns = now - pace[ARRIVED] - period_ns
-    skipped = missed(count, jumped, late_ns, period_ns)
-    k, deadline_ns = k + skipped, deadline_ns + skipped * period_ns
-    expected_ns = pace[ARRIVED] + (1 + skipped) * period_ns
-    pace[ARRIVED] = now if count > 0 else expected_ns
-    t["k"], t["t_ns"], t["gap"], t["skipped"] = k, deadline_ns, 1 + skipped, skipped
-    t["lateness_ns"] = min(max(now - expected_ns, -MAX_NS), MAX_NS)
-    t["request"] = max(asked, STOP) if k >= plan[END] else asked
-    return deadline_ns
+        came, jumped, ear[SYNCED] = ear[SYNCED], 0, 0
+        now = ear[STAMP] if came > 0 else now
+    wake(t, pace, plan[PERIOD_NS], came, jumped, now)
+    t["request"] = asked_at(table, int(t["k"]))
 
 
 @jit
@@ -369,25 +353,26 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
     t = ticks[0]
     request = t["request"]
-    due = is_due(pace, t["rx_flags"] & np.uint32(FRESH), t["gap"], plan[EVERY])
-    stamp(t, k, deadline_ns, deadline_ns, asked, log_failed)
-    count = follow(places, pace[ARRIVED] + plan[WAIT_NS if due else PERIOD_NS], QUEUE_MOST)
+    stamp(t, k, deadline_ns, 1, 0)
+    begin(t, asked, log_failed)
+    wait = plan[WAIT_NS if is_due(pace, plan[EVERY]) else PERIOD_NS]
+    came = follow(places, pace[ARRIVED] + wait, QUEUE_MOST)
     mark(marks, READ, times)
-    if count == WAITS:
+    if came == WAITS:
         return NOT_BEGUN
-    if count == LEFT:
+    if came == LEFT:
         pace[HEARD] = array_at(places, IO, I8)[TAKEN]
         return BEGUN
     if len(words) > 0:
         t["rx_flags"] |= guardian_flags(words)
-    return conclude(table, ticks, heard(table, t, k, deadline_ns, asked, count), request)
+    heard(table, t, came)
+    return conclude(table, ticks, int(t["t_ns"]), request)
 
 
 @jit
 def asked_at(table: Any, k: int) -> Any:
-    """What is asked of the supervisor in tick k; at the end of the run a stop, at least."""
-    asked = array_at(table, REQUEST, I8)[0]
-    return max(asked, STOP) if k >= array_at(table, PLAN, I8)[END] else asked
+    """What is asked of the supervisor in tick k."""
+    return asked_in(k, array_at(table, PLAN, I8)[END], array_at(table, REQUEST, I8)[0])
 
 
 @jit
@@ -400,7 +385,7 @@ def news(table: Any) -> Any:
 def run_ticks(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
     """Ticks from k on, the first at its deadline [ns], until one is left to the loop or Python has its turn.
 
-    Returns the stage of :mod:`hil.runtime.loop` that the last one reached; the pace says how many ran.
+    Returns the stage of :mod:`hil.runtime.rules` that the last one reached; the pace says how many ran.
     """
     plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
     before = news(table)
@@ -409,13 +394,11 @@ def run_ticks(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
             stage = run_followed(table, k, deadline_ns, asked_at(table, k), log_failed)
         else:
             stage = run_tick(table, k, deadline_ns, asked_at(table, k), log_failed)
-        if stage > BEGUN:
-            t = array_at(table, TICK_AT, TICK)[0]
-            k, deadline_ns = int(t["k"]), int(t["t_ns"])
-            pace[LOST], pace[NEXT] = pace[LOST] + t["skipped"], k
         if stage != RECORDED:
             return stage
-        pace[RAN], pace[NEXT] = pace[RAN] + 1, k + 1
+        t = array_at(table, TICK_AT, TICK)[0]
+        k, deadline_ns = int(t["k"]), int(t["t_ns"])
+        pace[RAN], pace[LOST], pace[NEXT] = pace[RAN] + 1, pace[LOST] + t["skipped"], k + 1
         if pace[RAN] >= plan[TOGETHER] or k % STEER_EVERY == 0 or news(table) != before:
             return RECORDED
         k, deadline_ns = k + 1, deadline_ns + plan[PERIOD_NS]

@@ -67,12 +67,13 @@ from hil.runtime.fused import (
     news,
     since,
     sleep_until,
-    stamp,
     table_of,
     timing_of,
 )
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, guardian_flags
-from hil.runtime.loop import (
+from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled
+from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
+from hil.runtime.rules import (
     BEGUN,
     DECIDED,
     DID,
@@ -82,12 +83,9 @@ from hil.runtime.loop import (
     RECORDED,
     SENT,
     Pace,
-    Plan,
-    StopRequest,
-    Whole,
-    none_compiled,
+    begin,
+    stamp,
 )
-from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
 from hil.runtime.trouble import TROUBLE
 from hil.signals import TICK
 from hil.tick.kernel import PLACED, whole_at
@@ -327,7 +325,7 @@ def answer(nodes: Any, deadline_ns: int) -> Any:
 
 @jit
 def run_tick(nodes: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
-    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.loop` that it reached."""
+    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.rules` that it reached."""
     first = places_at(nodes, 0)
     times, marks = array_at(first, TIMES_AT, I8), array_at(first, MARKS, I8)
     mark(marks, LOOP, times)
@@ -338,7 +336,9 @@ def run_tick(nodes: Any, k: int, deadline_ns: int, asked: int, log_failed: bool)
         return NOT_BEGUN
     request = tick_of(first)["request"]
     for i in range(len(nodes)):
-        stamp(tick_of(places_at(nodes, i)), k, deadline_ns, woken_ns, asked, log_failed)
+        t = tick_of(places_at(nodes, i))
+        stamp(t, k, deadline_ns, 1, late_ns)
+        begin(t, asked, log_failed)
     stage = read(nodes, deadline_ns)
     mark(marks, READ, times)
     return conclude(nodes, deadline_ns, request) if stage == DECIDED else stage
@@ -397,7 +397,6 @@ def run_together(nodes: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
     before = news(first)
     while True:
         stage = run_tick(nodes, k, deadline_ns, asked_at(first, k), log_failed)
-        pace[NEXT] = k
         if stage != RECORDED:
             return stage
         pace[RAN], pace[NEXT] = pace[RAN] + 1, k + 1

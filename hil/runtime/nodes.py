@@ -21,24 +21,20 @@ from hil.ports import Clock, Inbox
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, GUARD_NS, Words, guardian_flags
 from hil.runtime.loop import (
     BUS_DOWN,
-    DECIDED,
-    DID,
     ENDED,
     FULL,
     SEND_FAILED,
-    Cells,
     Loop,
     Outcome,
-    Pace,
     Plan,
     StopRequest,
     Whole,
-    bounded,
     no_whole,
     transition_event,
 )
+from hil.runtime.rules import DECIDED, DID, Fields, Pace, begin, bounded, stamp
 from hil.runtime.trouble import TROUBLE, Trouble
-from hil.signals import ALL_MISSING, DriveState, Reason, Request, TickArray, cell, ticks_from
+from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
 from hil.tick.pair import ask, leads, tell
 
 COUNTERS: Final = GUARD_NS + 1
@@ -47,7 +43,6 @@ ALONE: Final = (int(Reason.NONE), int(Reason.STOP_REQUESTED), int(Reason.NODE_ST
 """Reasons with which a node leaves the others as they are: each ends an orderly stop by its own ramp."""
 LEFT: Final = -1
 """In place of how many commands are sent: none, the laws have run, and the others must stop with one."""
-SHARED: Final = ("k", "t_ns", "gap", "skipped", "lateness_ns", "request", "log_failed")
 NODE_STOPPED: Final = int(Request.NODE_STOPPED)
 
 
@@ -91,8 +86,7 @@ class Axis:
     def __init__(self, name: str, client: Client, machine: Machine, ticks: TickArray) -> None:
         self.name, self.client, self.machine, self.ticks = name, client, machine, ticks
         self.tick: Any = ticks[0]
-        self.cells: Any = Cells(ticks)
-        self.counter: Any = cell(ticks, "counter")
+        self.t = Fields(ticks)
         self.step = machine.looped()
         self.outcome = Outcome()
         self.ended = False
@@ -106,38 +100,30 @@ class Axis:
         """Bytes of its controller's states, then of what :meth:`decide` keeps of them."""
         return [*self._live, *self._kept]
 
-    def begin(self, first: Any) -> None:
-        """Stamp the tick as the first node's."""
-        cells = self.cells
-        if cells is not first:
-            for name in SHARED:
-                getattr(cells, name)[0] = getattr(first, name)[0]
-        cells.rx_flags[0], cells.missing[0] = 0, ALL_MISSING
-
     def decide(self) -> bool:
         """Run the controller; True when the others must stop with it."""
         for kept, live in zip(self._kept, self._live, strict=True):
             kept[:] = live
         self.step(self.ticks)
-        return self.cells.reason[0] not in ALONE
+        return self.t["reason"] not in ALONE
 
     def stop_too(self) -> None:
         """The same tick once more for a node that has no reason of its own: another one has."""
-        if self.cells.reason[0]:
+        if self.t["reason"]:
             return
         for kept, live in zip(self._kept, self._live, strict=True):
             live[:] = kept
-        self.cells.request[0] = NODE_STOPPED
+        self.t["request"] = NODE_STOPPED
         self.step(self.ticks)
 
     def conclude(self) -> None:
         """Find out whether this node's run has ended."""
-        cells, outcome = self.cells, self.outcome
-        if cells.reason[0]:
+        t, outcome = self.t, self.outcome
+        if t["reason"]:
             if outcome.stop is None:
                 outcome.stop = ticks_from(self.ticks.tobytes())
-            outcome.state, outcome.reason = cells.state[0], cells.reason[0]
-            self.ended = cells.state[0] in ENDED
+            outcome.state, outcome.reason = t["state"], t["reason"]
+            self.ended = t["state"] in ENDED
 
 
 class Together:
@@ -235,27 +221,29 @@ class NodesLoop(Loop):
 
         return tell
 
-    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int, begun: bool = False) -> int:
+    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         """A tick of all nodes, each of which has feedback in every tick."""
-        now, words = self._clock.now_ns, self._words
-        if not begun:
-            self._pace[DID] = 0
-            self._stamp(k, deadline_ns, gap, now_ns)
-            for axis in self._axes:
-                axis.begin(self._cells)
-        if words is not None:
-            words[BEAT_NS] = now()
-        self._exchange(tick, deadline_ns, True)
-        guarded = 0 if words is None else guardian_flags(words)
-        received_ns = bounded(now() - deadline_ns)
+        asked, self._pace[DID] = self._asked(k), 0
         for axis in self._axes:
-            axis.cells.rx_flags[0] |= guarded
-            axis.cells.received_ns[0] = received_ns
+            stamp(axis.t, k, deadline_ns, gap, now_ns - deadline_ns)
+            begin(axis.t, asked, self._recorder.failed)
+        self._begun(tick)
+
+    def _begun(self, tick: Any) -> None:
+        """Ticks that are stamped, of which a compiled one may have read a part."""
+        words = self._words
+        if words is not None:
+            words[BEAT_NS] = self._clock.now_ns()
+        self._exchange(tick)
+        guarded = 0 if words is None else guardian_flags(words)
+        received_ns = bounded(self._clock.now_ns() - self._t["t_ns"])
+        for axis in self._axes:
+            axis.t["rx_flags"] |= guarded
+            axis.t["received_ns"] = received_ns
         self._pace[DID] = LEFT if self._decided() else 0
-        self._computed(deadline_ns)
-        self._answer(tick, deadline_ns)
-        self._note(k, deadline_ns)
-        return k
+        self._computed()
+        self._answer(tick)
+        self._note()
 
     def _decided(self) -> bool:
         """Each node's controller, one that commands the other first; True when all must stop with one."""
@@ -268,51 +256,51 @@ class NodesLoop(Loop):
         ask(lead.ticks, load.ticks, load.machine.law)
         return load.decide() or leaves
 
-    def _computed(self, deadline_ns: int) -> None:
+    def _computed(self) -> None:
         """Once one has left by a fault or a quick stop, all stop in this tick; then the laws have run."""
         if self._pace[DID] == LEFT:
             for axis in self._axes:
                 axis.stop_too()
             self._pace[DID] = 0
-        computed_ns = bounded(self._clock.now_ns() - deadline_ns)
+        computed_ns = bounded(self._clock.now_ns() - self._t["t_ns"])
         for axis in self._axes:
-            axis.cells.computed_ns[0] = computed_ns
+            axis.t["computed_ns"] = computed_ns
 
-    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> int:
+    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> None:
         """What is left of a tick, of which several nodes' may have stopped."""
         if stage == DECIDED and self._pace[DID] == LEFT:
-            self._computed(deadline_ns)
-        return super()._rest(stage, tick, k, deadline_ns)
+            self._computed()
+        super()._rest(stage, tick, k, deadline_ns)
 
     def _states(self) -> tuple[int, ...]:
         """Of each node's supervisor."""
-        return tuple(axis.cells.state[0] for axis in self._axes)
+        return tuple(axis.t["state"] for axis in self._axes)
 
-    def _exchange(self, tick: Any, deadline_ns: int, due: bool) -> None:
+    def _exchange(self, tick: Any) -> None:
         """SYNC out and feedback in; a SYNC that is not out is told to all."""
         try:
-            until_ns = self._clock.receive_deadline(deadline_ns, self._plan.timeout_ns)
+            until_ns = self._clock.receive_deadline(self._t["t_ns"], self._plan.timeout_ns)
             self._together.exchange(tick, until_ns, self._pace[DID])
         except OSError as error:
             for axis in self._axes:
-                axis.cells.rx_flags[0] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
+                axis.t["rx_flags"] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
 
-    def _answer(self, tick: Any, deadline_ns: int) -> None:
+    def _answer(self, tick: Any) -> None:
         """The commands, in the configuration's order, unless the guardian has stopped the drives."""
         words, axes = self._words, self._axes
         if words is not None:
             words[BEAT_NS] = self._clock.now_ns()
             for place, axis in enumerate(axes, COUNTERS):
-                words[place] = axis.counter[0]
-            words[ARMED] = any(axis.cells.state[0] != DISARMED for axis in axes)
+                words[place] = axis.t["counter"]
+            words[ARMED] = any(axis.t["state"] != DISARMED for axis in axes)
         for axis in axes[self._pace[DID] :]:
-            if axis.cells.send[0]:
+            if axis.t["send"]:
                 self._command(axis)
-            axis.cells.sent_ns[0] = bounded(self._clock.now_ns() - deadline_ns)
+            axis.t["sent_ns"] = bounded(self._clock.now_ns() - axis.t["t_ns"])
 
     def _command(self, axis: Axis) -> None:
         """Send one node's command; a bus that does not take it is seen in the next tick."""
-        t, why = axis.cells, "the guardian has stopped the drive"
+        t, why = axis.t, "the guardian has stopped the drive"
         try:
             if self._words is None or not self._words[FIRED]:
                 axis.client.send(axis.tick)
@@ -320,21 +308,21 @@ class NodesLoop(Loop):
                 return
         except OSError as error:
             why = str(error)
-        self._recorder.event(t.t_ns[0], t.k[0], "send-failed", f"{axis.name}: {why}")
+        self._recorder.event(t["t_ns"], t["k"], "send-failed", f"{axis.name}: {why}")
 
-    def _note(self, k: int, deadline_ns: int) -> None:
+    def _note(self) -> None:
         """Log what is new of each node, then the records."""
-        super()._note(k, deadline_ns)
+        super()._note()
         for axis, trouble in zip(self._more, self._troubles, strict=True):
-            cells = axis.cells
-            if cells.rx_flags[0] & TROUBLE:
-                trouble.note(deadline_ns, k, cells.rx_flags[0])
-            if cells.state[0] != axis.noted:
-                axis.noted = cells.state[0]
-                kind, text = transition_event(axis.noted, cells.reason[0])
-                self._recorder.event(deadline_ns, k, kind, f"{axis.name}: {text}")
+            t = axis.t
+            if t["rx_flags"] & TROUBLE:
+                trouble.note(t["t_ns"], t["k"], t["rx_flags"])
+            if t["state"] != axis.noted:
+                axis.noted = t["state"]
+                kind, text = transition_event(axis.noted, t["reason"])
+                self._recorder.event(t["t_ns"], t["k"], kind, f"{axis.name}: {text}")
         self._rings.more_ticks()
         for axis in self._axes:
-            axis.cells.recorded_ns[0] = self._cells.recorded_ns[0]
+            axis.t["recorded_ns"] = self._t["recorded_ns"]
             axis.conclude()
         self._ended = all(axis.ended for axis in self._axes)

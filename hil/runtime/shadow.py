@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hil.ports import Drive
-from hil.runtime.loop import NO_WAIT
+from hil.runtime.rules import NO_WAIT
 from hil.signals import RxFlag
 
 Applied = Callable[[int], tuple[float, float]]

@@ -21,7 +21,7 @@ from hil.errors import ConfigError, HilError
 from hil.identify.plan import Skipped, config_of, make
 from hil.log.reader import open_log
 from hil.replay import replay
-from hil.runtime.loop import SINCE, is_due, new_pace
+from hil.runtime.rules import SINCE, count, is_due, new_pace
 from hil.runtime.session import run
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Reason, RxFlag
@@ -125,11 +125,16 @@ def test_measurements_that_stop_coming_stop_the_run(hold: int, ticks: int) -> No
 
 def test_a_tick_waits_for_feedback_when_it_is_due() -> None:
     pace, fresh = new_pace(), [1, 0, 0, 0, 0, 1, 0, 0, 0]
-    assert [is_due(pace, one, 1, 3) for one in fresh] == [
+
+    def due(fresh: int, gap: int, every: int) -> bool:
+        count(pace, {"rx_flags": fresh, "gap": gap})
+        return is_due(pace, every)
+
+    assert [due(one, 1, 3) for one in fresh] == [
         False, False, True, True, True, False, False, True, True,
     ]  # fmt: skip
-    assert is_due(pace, 1, 1, 1) and pace[SINCE] == 0
-    assert not is_due(pace, 0, 1, 3) and is_due(pace, 0, 4, 6) and pace[SINCE] == 5
+    assert due(1, 1, 1) and pace[SINCE] == 0
+    assert not due(0, 1, 3) and due(0, 4, 6) and pace[SINCE] == 5
 
 
 @pytest.mark.parametrize(

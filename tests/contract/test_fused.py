@@ -44,23 +44,8 @@ from hil.runtime.guardian import (
 )
 from hil.runtime.header import header_of
 from hil.runtime.inbox import Inbox, Place, ranges
-from hil.runtime.loop import (
-    BEGUN,
-    DECIDED,
-    NOT_BEGUN,
-    RAMP_EVENT,
-    RAN,
-    RECORDED,
-    SENT,
-    Loop,
-    Pace,
-    Plan,
-    StopRequest,
-    Whole,
-    new_pace,
-    no_whole,
-    none_compiled,
-)
+from hil.runtime.loop import RAMP_EVENT, Loop, Plan, StopRequest, Whole, no_whole, none_compiled
+from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, RAN, RECORDED, SENT, Pace, new_pace
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
@@ -292,6 +277,35 @@ def between(*raws: bytes) -> Act:
     return act
 
 
+@now_and_then(30, 50)
+def late_and_judged(drive: Drive, n: int) -> None:
+    """Status and a spoiled frame after the command, which the next tick finds waiting."""
+    drive.end.send(drive.feedback(n))
+    spoiled = bytearray(drive.feedback(n))
+    spoiled[-1] ^= 1
+    drive.counter -= 1
+    drive.after_command(lambda: [drive.end.send(raw) for raw in (drive.status(n), spoiled)] and None)
+
+
+def and_judged(other: Act, *at: int) -> Act:
+    """A frame that the kernel hands back, before these answers."""
+
+    def act(drive: Drive, n: int) -> None:
+        if n in at:
+            drive.end.send(pack_frame(EMERGENCY, bytes(8)))
+        other(drive, n)
+
+    return act
+
+
+def seldom(drive: Drive, n: int) -> None:
+    """Feedback on every third SYNC; after one without it a frame that the kernel hands back."""
+    if n in (31, 49):
+        drive.end.send(pack_frame(EMERGENCY, bytes(8)))
+    if n % 3 == 0:
+        calm(drive, n)
+
+
 MOTOR_TOO_HOT = pack_frame(EMERGENCY, bytes((0x10, 0x43, 1, 0, 0, 0, 0, 0)))
 emergency_late = now_and_then(30, 50)(between(MOTOR_TOO_HOT))
 second_master_late = now_and_then(60)(between(pack_frame(COMMAND, bytes(8))))
@@ -459,7 +473,7 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
     words, machine = Words(), setup.machine.fresh()
     words.cells[GUARD_NS] = TIME.now_ns
     pacing = setup.config.loop.pacing
-    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS, together=TOGETHER)
+    plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS, 3 if case[0] == "seldom" else 1, TOGETHER)
     recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
     recorder.await_open()
     failure = ""
@@ -554,6 +568,7 @@ CASES: dict[str, tuple[Act, set[int], str]] = {
     "emergency that is over": (emergency, {SENT, BEGUN}, "STOP_REQUESTED"),
     "emergency": (alarm, {SENT, BEGUN}, "STOP_REQUESTED"),
     "late emergency": (emergency_late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "late frames and an emergency": (and_judged(late_and_judged, 31, 51), {SENT, BEGUN}, "STOP_REQUESTED"),
     "second master between ticks": (second_master_late, {SENT, NOT_BEGUN}, "FOREIGN_COMMAND"),
     "strangers' frames": (strangers, {SENT}, "STOP_REQUESTED"),
     "second master": (second_master, {SENT, BEGUN}, "FOREIGN_COMMAND"),
@@ -590,6 +605,15 @@ def test_the_ramp_of_a_stop_is_compiled(both: Both) -> None:
     assert w_ref[0] > 0 and w_ref[-1] == 0 and (np.diff(w_ref) <= 0).all() and asked.sum() > 20
     assert [e["text"] for e in compiled.log.events].count(RAMP_EVENT[1]) == 1
     assert compiled.stages[RECORDED] > asked.sum() and compiled.ended == "STOP_REQUESTED"
+
+
+def test_a_tick_without_feedback_that_is_due_waits_for_none(both: Both) -> None:
+    """One that is left to the loop before it has begun, too."""
+    rules, compiled = both(("seldom", "emergency"))
+    assert_same(rules, compiled)
+    waited = compiled.log.ticks["received_ns"]
+    assert compiled.stages[NOT_BEGUN] == 2 and compiled.ended == "STOP_REQUESTED"
+    assert (waited[32], waited[50]) == (0, 0) and waited[33] == waited[51] == ANSWER_NS
 
 
 LATE = ("late emergency", "second master between ticks")
@@ -658,6 +682,7 @@ TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
     "by feedback": FOLLOWED,
     "by the kernel": BY_THE_KERNEL,
     "ramp": {"stop": (stopped, set(), "STOP_REQUESTED")},
+    "seldom": {"emergency": (seldom, set(), "STOP_REQUESTED")},
 }
 """Who sends SYNC, or that nobody does; then what happens."""
 

@@ -27,22 +27,11 @@ from hil.runtime import fusednodes
 from hil.runtime.clock import RealClock
 from hil.runtime.guardian import FIRED, GUARD_NS, GUARDIAN_LOST_NS, Words
 from hil.runtime.inbox import Inbox
-from hil.runtime.loop import (
-    BEGUN,
-    DECIDED,
-    NOT_BEGUN,
-    RAN,
-    RECORDED,
-    SENT,
-    Pace,
-    Plan,
-    StopRequest,
-    Whole,
-    no_whole,
-)
+from hil.runtime.loop import Plan, StopRequest, Whole, no_whole
 from hil.runtime.nodes import Axis, NodesLoop
 from hil.runtime.nodesession import _places, nodes_header
 from hil.runtime.nodesetup import load_node_setups
+from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, RAN, RECORDED, SENT, Pace
 from hil.runtime.session import set_by_others
 from hil.runtime.setup import Overrides
 from hil.signals import FIELDS, Reason, RxFlag

@@ -16,7 +16,8 @@ from hil.log.recorder import Recorder
 from hil.runtime import fused
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.header import header_of
-from hil.runtime.loop import NOT_BEGUN, Loop, Pace, Plan, StopRequest, Whole, none_compiled
+from hil.runtime.loop import Loop, Plan, StopRequest, Whole, none_compiled
+from hil.runtime.rules import NOT_BEGUN, Pace
 from hil.runtime.setup import Overrides, load_setup
 from tests.conftest import CONFIGS
 

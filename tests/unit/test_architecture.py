@@ -105,6 +105,7 @@ def test_the_loop_knows_ports_signals_and_control_only(name: str) -> None:
         "hil.tick.supervisor",
         "hil.tick.setpoint",
         "hil.runtime.trouble",
+        "hil.runtime.rules",
     )
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from drivers.errors import EncodeError
 from hil.runtime.clock import FakeClock, LockstepClock, RealClock
-from hil.runtime.loop import NO_WAIT, Loop, Outcome, Plan, StopRequest
+from hil.runtime.loop import Loop, Outcome, Plan, StopRequest
+from hil.runtime.rules import NO_WAIT
 from hil.runtime.trouble import QUIET_TICKS
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, new_ticks
 
