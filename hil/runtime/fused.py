@@ -2,9 +2,10 @@
 
 Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
 long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
-ports. Its rules are those of :mod:`hil.runtime.rules`: SYNC and feedback are :func:`drivers.posix.exchange`; law, supervisor and
-guard :func:`hil.tick.kernel.whole_at`; the command :func:`drivers.posix.command`; the records
-:func:`hil.log.push.push`; the guardian's words as :class:`hil.runtime.guardian.GuardedDrive` keeps them.
+ports. Its rules are those of :mod:`hil.runtime.rules`; SYNC and feedback are :func:`drivers.posix.exchange`,
+law, supervisor and guard :func:`hil.tick.kernel.whole_at`, the command :func:`drivers.posix.command`, the
+records :func:`hil.log.push.push`, and the guardian's words as its :class:`~hil.runtime.guardian.GuardedDrive`
+keeps them.
 At the first thing that is unusual it returns the stage that it reached, and the loop does the rest. Some
 ticks run in one call, without Python in between: what others may ask of a run meanwhile is memory that is
 looked at before each tick.
@@ -49,7 +50,7 @@ from hil.config.design import Machine
 from hil.log.push import HEADER, NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.log.ring import FAILED_AT
-from hil.runtime.guardian import ARMED, BEAT_NS, COUNTER, DISARMED, FIRED, Words, guardian_flags
+from hil.runtime.guardian import FIRED, Words, beats, commands, guardian_flags
 from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, wait_ns
 from hil.runtime.rules import (
     ARRIVED,
@@ -239,10 +240,8 @@ def read(table: Any, t: Any, deadline_ns: int, due: bool) -> Any:
     words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
     places, times = places_at(table, RECEIVE), array_at(table, TIMES_AT, I8)
     io = array_at(places, IO, I8)
-    if len(words) > 0:
-        words[BEAT_NS] = now_ns(times)
-        if words[FIRED] != 0:
-            return NOT_BEGUN
+    if len(words) > 0 and beats(words, now_ns(times)):
+        return NOT_BEGUN
     code = exchange(places, plan[SYNC_BYTES], deadline_ns + (plan[TIMEOUT_NS] if due else 0))
     if code == PENDING:
         return NOT_BEGUN
@@ -261,11 +260,8 @@ def answer(table: Any, t: Any) -> Any:
     times, io = array_at(table, TIMES_AT, I8), array_at(places, IO, I8)
     if t["send"] == 0:
         return SENT
-    if len(words) > 0:
-        words[BEAT_NS] = now_ns(times)
-        words[ARMED], words[COUNTER] = int(t["state"] != DISARMED), t["counter"]
-        if words[FIRED] != 0:
-            return DECIDED
+    if len(words) > 0 and commands(words, now_ns(times), t["state"], t["counter"]):
+        return DECIDED
     code = command(places)
     if code != DONE:
         io[COMMANDED] = code

@@ -70,7 +70,7 @@ from hil.runtime.fused import (
     table_of,
     timing_of,
 )
-from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, guardian_flags
+from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, beats, guardian_flags
 from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled
 from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
 from hil.runtime.rules import (
@@ -209,10 +209,8 @@ def read(nodes: Any, deadline_ns: int) -> Any:
     words, pace, plan = array_at(first, WORDS, I8), array_at(first, PACE, I8), array_at(first, PLAN, I8)
     if waits(nodes):
         return NOT_BEGUN
-    if len(words) > 0:
-        words[BEAT_NS] = now_of(first)
-        if words[FIRED] != 0:
-            return NOT_BEGUN
+    if len(words) > 0 and beats(words, now_of(first)):
+        return NOT_BEGUN
     pace[DID] = 0
     for i in range(1, len(nodes)):
         if take_late(places_at(nodes, i)) != DONE:

@@ -69,6 +69,21 @@ def guardian_flags(words: Any) -> int:
     return GUARDIAN_LOST if words[BEAT_NS] - words[GUARD_NS] > GUARDIAN_LOST_NS else 0
 
 
+@register_jitable
+def beats(words: Any, now_ns: int) -> bool:
+    """Tell it of a tick; True once it has stopped the drive and nothing may be sent."""
+    words[BEAT_NS] = now_ns
+    return bool(words[FIRED] != 0)
+
+
+@register_jitable
+def commands(words: Any, now_ns: int, state: int, counter: int) -> bool:
+    """:func:`beats` before a tick's command: what the guardian stops, and after which counter."""
+    beats(words, now_ns)
+    words[ARMED], words[COUNTER] = int(state != DISARMED), counter
+    return bool(words[FIRED] != 0)
+
+
 class Stopper(Protocol):
     """What can send the stop frames."""
 
@@ -105,9 +120,7 @@ class GuardedDrive:
 
     def exchange(self, tick: Any, deadline_ns: int) -> None:
         """SYNC, unless the guardian has stopped the drive; feedback, and what the guardian did."""
-        words = self._words
-        words[BEAT_NS] = self._now()
-        if words[FIRED]:
+        if beats(self._words, self._now()):
             self.receive(tick, deadline_ns)
             return
         self._drive.exchange(tick, deadline_ns)
@@ -125,11 +138,7 @@ class GuardedDrive:
 
     def send(self, tick: Any) -> None:
         """The command. Raises OSError once the guardian has stopped the drive; the record stays as it is."""
-        words = self._words
-        words[BEAT_NS] = self._now()
-        words[ARMED] = self._state[0] != DISARMED
-        words[COUNTER] = self._counter[0]
-        if words[FIRED]:
+        if commands(self._words, self._now(), self._state[0], self._counter[0]):
             raise OSError(errno.ECANCELED, "the guardian has stopped the drive")
         self._drive.send(tick)
 

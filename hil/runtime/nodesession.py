@@ -17,11 +17,10 @@ from drivers.hub import links_of
 from hil.config.design import Machine
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder, check_folder
-from hil.runtime import fused, fusednodes, realtime
+from hil.runtime import fused, fusednodes
 from hil.runtime.bus import opened_link
-from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
-from hil.runtime.guardian import Rights, Words, guardian
+from hil.runtime.guardian import Words
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes
 from hil.runtime.loop import Outcome, StopRequest, no_whole
@@ -30,19 +29,20 @@ from hil.runtime.nodesetup import Nodes, check_nodes_load
 from hil.runtime.progress import say
 from hil.runtime.refusals import check_arming, check_reachable, check_set_up, needed_bytes
 from hil.runtime.session import (
+    Ended,
     RunResult,
+    alone,
     await_drive,
-    driving,
+    end_of,
+    guarding,
     hear_others,
     plan_of,
-    released,
+    run_armed,
     set_by_others,
     writing,
 )
-from hil.runtime.setup import Setup
 from hil.signals import Reason
-from hil.tick.errorcodes import words as error_words
-from hil.tick.reasons import End, explain
+from hil.tick.reasons import End
 
 Clock = LockstepClock | RealClock
 
@@ -57,13 +57,15 @@ def run_nodes(setups: Nodes, *, arm: bool = False, request: StopRequest | None =
     config, path = first.config, log_path(first, "run")
     check_folder(path, len(setups) * needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
-    with _alone(setups), writing(Recorder(path, None, config.loop.rate_hz, len(setups))) as recorder:
+    with alone(*setups.values()), writing(Recorder(path, None, config.loop.rate_hz, len(setups))) as recorder:
         for name, setup in setups.items():
             setup.machine.looped()
             with _said_of(name):
                 check_set_up(setup)
         fusednodes.load()
-        with _guarding(setups, recorder) as words:
+        shared = Words()
+        stopper = partial(_stopper, setups, shared)
+        with guarding(config, recorder, stopper, shared) as words:
             return _recorded(setups, request or StopRequest(), recorder, clock, words)
 
 
@@ -74,20 +76,6 @@ def _said_of(name: str) -> Iterator[None]:
         yield
     except ArmingError as error:
         raise ArmingError(f"node {name}: {error}") from error
-
-
-@contextlib.contextmanager
-def _alone(setups: Nodes) -> Iterator[None]:
-    """No other process of this machine may send what this run sends. Raises ArmingError."""
-    bus, sent = next(iter(setups.values())).config.bus, []
-    for setup in setups.values():
-        sent += [bound.message for bound in setup.binding.outgoing]
-        sent += [setup.binding.sync] if setup.binding.sync else []
-    try:
-        with claimed(bus.interface, bus.channel, {f"0x{message.send_id:X}" for message in sent}):
-            yield
-    except ClaimedError as error:
-        raise ArmingError(f"nothing was sent: {error}; to look on: hil watch") from error
 
 
 def _clients(setups: Nodes, recorder: Recorder | None, clock: Clock | None) -> list[DriveClient]:
@@ -114,22 +102,9 @@ class Stopper:
             client.stop_from(self._cells[place])
 
 
-@contextlib.contextmanager
-def _guarding(setups: Nodes, recorder: Recorder) -> Iterator[Words | None]:
-    """One guardian for all nodes, unless time stands still or the bus is this process's own."""
-    config = next(iter(setups.values())).config
-    if config.bus.interface == "virtual" or config.loop.clock == "lockstep" or not config.guardian.enabled:
-        yield None
-        return
-    shared, asked = Words(), config.realtime
-
-    def stopper() -> Stopper:
-        recorder.leave()
-        return Stopper(_clients(setups, None, None), shared.cells)
-
-    rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
-    with guardian(config.guardian.timeout_ns(config.loop), rights, stopper, shared) as words:
-        yield words
+def _stopper(setups: Nodes, words: Words) -> Stopper:
+    """With clients of its own."""
+    return Stopper(_clients(setups, None, None), words.cells)
 
 
 def _recorded(
@@ -168,7 +143,8 @@ def _recorded(
         loop = NodesLoop(axes, clock, recorder, plan, request, words, real, box)
         for client in clients:
             client.discard()
-        return _run_armed(first, axes, loop, recorder, clock, request, takes)
+        ended = partial(_ended, axes, recorder, clock)
+        return run_armed(first.config, loop, recorder, clock, request, ended, takes[axes[0].name], takes)
 
 
 def _places(machines: Sequence[Machine], takes: Mapping[str, Takes]) -> list[Place]:
@@ -195,63 +171,23 @@ def nodes_header(setups: Nodes, clock: str) -> dict[str, Any]:
     return header
 
 
-def _run_armed(
-    first: Setup,
-    axes: Sequence[Axis],
-    loop: NodesLoop,
-    recorder: Recorder,
-    clock: Clock,
-    request: StopRequest,
-    takes: Mapping[str, Takes],
-) -> RunResult:
-    outcome, failure, processor_ns = Outcome(), "", 0
-    grants: list[realtime.Grant] = []
-    try:
-        with driving(first.config, recorder, clock, request, takes[axes[0].name], takes) as grants:
-            begin_ns = time.thread_time_ns()
-            outcome = loop.run()
-            processor_ns = time.thread_time_ns() - begin_ns
-    except BaseException as error:
-        failure = f"{type(error).__name__}: {error}"
-        raise
-    finally:
-        last_k = outcome.ticks + outcome.skipped
-        released(first.config, recorder, clock, last_k)
-        ends = {axis.name: _end(axis, recorder, clock.now_ns(), last_k) for axis in axes}
-        cause = cause_of(axes)
-        dropped, result = recorder.dropped, _result(outcome, axes, ends, cause)
-        complete = recorder.close(result | ({"ended": failure} if failure else {}))
-        if not complete:
-            kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"
-            say(f"log {recorder.path} is not complete{kept}")
-    why = Outcome(
-        outcome.ticks, outcome.skipped, cause.outcome.reason, cause.outcome.state, cause.outcome.stop
-    )
-    processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
-    nodes = {axis.name: result["nodes"][axis.name] for axis in axes}
-    path = str(recorder.path)
-    return RunResult(path, why, complete, dropped, grants, processor_us, ends[cause.name], nodes)
+def _ended(axes: Sequence[Axis], recorder: Recorder, clock: Clock, outcome: Outcome, k: int) -> Ended:
+    """Why each node's run ended; the run's is that of the node for whose sake it did."""
+    now_ns = clock.now_ns()
+    ends = {
+        axis.name: end_of(axis.machine, axis.client, axis.outcome.stop, recorder, now_ns, k, f"{axis.name}: ")
+        for axis in axes
+    }
+    cause = cause_of(axes)
+    result, own = _result(outcome, axes, ends, cause), cause.outcome
+    why = Outcome(outcome.ticks, outcome.skipped, own.reason, own.state, own.stop)
+    return Ended(result, why, ends[cause.name], result["nodes"])
 
 
 def cause_of(axes: Sequence[Axis]) -> Axis:
     """The node for whose sake the run ended: the first with a reason that is not another node's."""
     own = [axis for axis in axes if axis.outcome.reason not in (Reason.NODE_STOPPED, Reason.STOP_REQUESTED)]
     return (own or list(axes))[0]
-
-
-def _end(axis: Axis, recorder: Recorder, now_ns: int, k: int) -> End | None:
-    """Why a node's run ended; what it said of itself goes to the log."""
-    if odd := axis.client.odd_length():
-        recorder.event(now_ns, k, "length", f"{axis.name}: {odd}")
-        say(f"{axis.name}: {odd}; none of another length is taken: correct the DBC, or the drive's mapping")
-    with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
-        axis.client.flush()
-    stop = axis.outcome.stop
-    if stop is None:
-        return None
-    if code := int(stop[0]["drive_error"]):
-        recorder.event(now_ns, int(stop[0]["k"]), "drive-error", f"{axis.name}: {error_words(code)}")
-    return explain(axis.machine.safety, axis.machine.safety_state, stop[0])
 
 
 def _result(

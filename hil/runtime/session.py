@@ -6,10 +6,10 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 from drivers.client import precompile
 from drivers.drive import Drive as BusDrive
@@ -25,7 +25,7 @@ from hil.runtime import fused, realtime
 from hil.runtime.bus import is_emulated_bus, new_client, note_interface, opened_client
 from hil.runtime.claim import ClaimedError, claimed
 from hil.runtime.clock import LockstepClock, RealClock
-from hil.runtime.guardian import GuardedDrive, Rights, Words, guardian
+from hil.runtime.guardian import GuardedDrive, Rights, Stopper, Words, guardian
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes, ranges
 from hil.runtime.loop import Loop, Outcome, Plan, StopRequest, no_whole
@@ -34,7 +34,7 @@ from hil.runtime.refusals import check_arming, check_load, check_reachable, chec
 from hil.runtime.registry import announced, own_entry, who_asked
 from hil.runtime.setup import Setup
 from hil.runtime.shadow import ShadowDrive
-from hil.signals import Reason, new_ticks
+from hil.signals import Reason, TickArray, new_ticks
 from hil.tick.errorcodes import words
 from hil.tick.reasons import End, explain
 
@@ -100,10 +100,10 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     path = log_path(setup, "run")
     check_folder(path, needed_bytes(config))
     clock = LockstepClock() if config.loop.clock == "lockstep" else RealClock()
-    with _alone(setup), writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
+    with alone(setup), writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
         compile_kernels(setup)  # while the writer starts
         check_set_up(setup)
-        with _guarding(setup, recorder) as words:
+        with guarding(config, recorder, partial(new_client, setup)) as words:
             return _recorded(setup, request, recorder, clock, words)
 
 
@@ -118,35 +118,40 @@ def writing(recorder: Recorder) -> Iterator[Recorder]:
 
 
 @contextlib.contextmanager
-def _alone(setup: Setup) -> Iterator[None]:
-    """No other process of this machine may send what this run sends. Raises ArmingError."""
-    binding, bus = setup.binding, setup.config.bus
-    sent = [bound.message for bound in binding.outgoing] + ([binding.sync] if binding.sync else [])
-    names = [] if setup.config.loop.shadow else [f"0x{message.send_id:X}" for message in sent]
+def alone(*setups: Setup) -> Iterator[None]:
+    """No other process of this machine may send what these send. Raises ArmingError."""
+    bus, sent = setups[0].config.bus, []
+    for binding in (setup.binding for setup in setups if not setup.config.loop.shadow):
+        sent += [bound.message for bound in binding.outgoing] + ([binding.sync] if binding.sync else [])
     try:
-        with claimed(bus.interface, bus.channel, names):
+        with claimed(bus.interface, bus.channel, [f"0x{message.send_id:X}" for message in sent]):
             yield
     except ClaimedError as error:
-        raise ArmingError(f"nothing was sent: {error}; to look on: hil watch, --shadow") from error
+        look = "hil watch, --shadow" if len(setups) == 1 else "hil watch"
+        raise ArmingError(f"nothing was sent: {error}; to look on: {look}") from error
 
 
 @contextlib.contextmanager
-def _guarding(setup: Setup, recorder: Recorder) -> Iterator[Words | None]:
-    """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own."""
+def guarding(
+    config: RunConfig, recorder: Recorder, opened: Callable[[], Stopper], words: Words | None = None
+) -> Iterator[Words | None]:
+    """A guardian for the run, unless time stands still, nothing is sent, or the bus is this process's own.
 
-    def client() -> BusDrive:
+    ``opened`` makes, in the guardian, what can stop the drives.
+    """
+
+    def stopper() -> Stopper:
         recorder.leave()
-        return new_client(setup)
+        return opened()
 
-    config = setup.config
-    loop, alone = config.loop, config.bus.interface == "virtual"
-    if alone or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
+    loop, own = config.loop, config.bus.interface == "virtual"
+    if own or loop.clock == "lockstep" or loop.shadow or not config.guardian.enabled:
         yield None
     else:
         timeout_ns, asked = config.guardian.timeout_ns(loop), config.realtime
         rights = Rights(asked.fifo_priority, asked.lock_memory, asked.cpu)
-        with guardian(timeout_ns, rights, client) as words:
-            yield words
+        with guardian(timeout_ns, rights, stopper, words) as shared:
+            yield shared
 
 
 def _recorded(
@@ -187,7 +192,14 @@ def _recorded(
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()
-            return _run_armed(setup, machine, loop, recorder, clock, request, takes, client)
+
+            def ended(outcome: Outcome, k: int) -> Ended:
+                end = end_of(machine, client, outcome.stop, recorder, clock.now_ns(), k)
+                result: dict[str, Any] = {"ended": Reason(outcome.reason).name.lower()}
+                result |= {"ticks": outcome.ticks, "skipped": outcome.skipped}
+                return Ended(result | ({"end": end.as_dict()} if end else {}), outcome, end, {})
+
+            return run_armed(config, loop, recorder, clock, request, ended, takes)
 
 
 @contextlib.contextmanager
@@ -249,20 +261,40 @@ def plan_of(config: RunConfig) -> Plan:
     return Plan(loop.period_ns, loop.timeout_ns, pacing, ticks, config.feedback_every)
 
 
-def _run_armed(
-    setup: Setup,
-    machine: Machine,
+class Tells(Protocol):
+    """What a drive's client says once the run is over."""
+
+    def odd_length(self) -> str:
+        """Which message came with another length than it should, in words."""
+
+    def flush(self) -> None:
+        """Hand on the frames that came and went."""
+
+
+class Ended(NamedTuple):
+    """Why a run ended: as the log keeps it, in ticks and skips, and of several nodes each one's."""
+
+    result: dict[str, Any]
+    outcome: Outcome
+    end: End | None
+    nodes: dict[str, Any]
+
+
+def run_armed(
+    config: RunConfig,
     loop: Loop,
     recorder: Recorder,
     clock: RealClock | LockstepClock,
     request: StopRequest,
+    ended: Callable[[Outcome, int], Ended],
     takes: Takes,
-    client: BusDrive,
+    nodes: Mapping[str, Takes] | None = None,
 ) -> RunResult:
+    """Run the loop and close the log. ``ended`` finds out why it ended, and with which tick."""
     grants: list[realtime.Grant] = []
     outcome, failure, processor_ns = Outcome(), "", 0
     try:
-        with driving(setup.config, recorder, clock, request, takes) as grants:
+        with driving(config, recorder, clock, request, takes, nodes) as grants:
             begin_ns = time.thread_time_ns()
             outcome = loop.run()
             processor_ns = time.thread_time_ns() - begin_ns
@@ -270,27 +302,38 @@ def _run_armed(
         failure = f"{type(error).__name__}: {error}"
         raise
     finally:
-        released(setup.config, recorder, clock, outcome.ticks + outcome.skipped)
-        if odd := client.odd_length():
-            recorder.event(clock.now_ns(), outcome.ticks + outcome.skipped, "length", odd)
-            say(f"{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
-        with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
-            client.flush()
-        dropped = recorder.dropped
-        ended = failure or Reason(outcome.reason).name.lower()
-        result: dict[str, Any] = {"ended": ended, "ticks": outcome.ticks, "skipped": outcome.skipped}
-        stop = outcome.stop
-        end = None if stop is None else explain(machine.safety, machine.safety_state, stop[0])
-        if end is not None:
-            result["end"] = end.as_dict()
-        if stop is not None and (code := int(stop[0]["drive_error"])):
-            recorder.event(clock.now_ns(), int(stop[0]["k"]), "drive-error", words(code))
-        complete = recorder.close(result)
+        last_k = outcome.ticks + outcome.skipped
+        released(config, recorder, clock, last_k)
+        why, dropped = ended(outcome, last_k), recorder.dropped
+        complete = recorder.close(why.result | ({"ended": failure} if failure else {}))
         if not complete:
             kept = "" if recorder.path.exists() else ": it was deleted or moved during the run"
             say(f"log {recorder.path} is not complete{kept}")
     processor_us = processor_ns * 1e-3 / max(outcome.ticks, 1)
-    return RunResult(str(recorder.path), outcome, complete, dropped, grants, processor_us, end)
+    path = str(recorder.path)
+    return RunResult(path, why.outcome, complete, dropped, grants, processor_us, why.end, why.nodes)
+
+
+def end_of(
+    machine: Machine,
+    client: Tells,
+    stop: TickArray | None,
+    recorder: Recorder,
+    now_ns: int,
+    k: int,
+    of: str = "",
+) -> End | None:
+    """Why a drive's run ended, in the tick ``stop``; what it said of itself is logged after ``of``."""
+    if odd := client.odd_length():
+        recorder.event(now_ns, k, "length", of + odd)
+        say(f"{of}{odd}; no frame of another length is taken: correct the DBC, or the drive's mapping")
+    with contextlib.suppress(Exception):  # after the guardian's stop nothing else hands them on
+        client.flush()
+    if stop is None:
+        return None
+    if code := int(stop[0]["drive_error"]):
+        recorder.event(now_ns, int(stop[0]["k"]), "drive-error", of + words(code))
+    return explain(machine.safety, machine.safety_state, stop[0])
 
 
 @contextlib.contextmanager
