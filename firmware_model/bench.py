@@ -19,7 +19,7 @@ from drivers.errors import LinkError
 from drivers.lockstep import tick_over
 from firmware_model.faulty_link import FaultyLink
 from firmware_model.load import load_torque
-from firmware_model.node import RUN_OUT_NS, Node
+from firmware_model.node import Node, run_out
 from firmware_model.plant import ANGLE
 from firmware_model.registry import PlantError
 from firmware_model.shaft import Shaft, couple
@@ -75,11 +75,6 @@ class Coupled(Node):
         return self._clock == "lockstep"
 
     @property
-    def period_ns(self) -> int:
-        """The loop's period."""
-        return self._period_ns
-
-    @property
     def sync_id(self) -> int | None:
         """Identifier of the SYNC that it answers."""
         return self._frames.sync_id
@@ -104,16 +99,6 @@ class Coupled(Node):
         while (through := self.faulty.receive(0)) is not None or self.tap.heard:
             if through is not None:
                 self.take(through)
-
-    @property
-    def has_faults(self) -> bool:
-        """Whether it has a fault script or a black box."""
-        return self._faults is not None
-
-    def close_box(self) -> None:
-        """What is seen from now on is no more the run's."""
-        if self._faults is not None:
-            self._faults.box.closed = True
 
     def catch_up(self) -> None:
         """Realtime: the plant comes to now."""
@@ -171,16 +156,7 @@ class Bench:
             for node in self._nodes:
                 node.beat(now)
             self._serve(min(max(min(n.next_beat for n in self._nodes) - now, 0), IDLE_NS))
-        self._run_out()
-
-    def _run_out(self) -> None:
-        """As a node's: left alone, drives with faults meet their watchdogs."""
-        if any(node.has_faults for node in self._nodes):
-            for node in self._nodes:
-                node.close_box()
-            for _ in range(RUN_OUT_NS // self._nodes[0].period_ns):
-                for node in self._nodes:
-                    node.pass_time()
+        run_out(*self._nodes)
 
     def _serve(self, timeout_ns: int) -> None:
         try:

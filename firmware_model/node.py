@@ -65,6 +65,16 @@ def compile_kernels(params: Record, state: Record) -> None:
     advance_open_phase(params[0], state[0], np.zeros(1), 1000)
 
 
+def run_out(*nodes: Node) -> None:
+    """Lockstep with faults: drives that are left alone meet their watchdogs, as they would in real time."""
+    faults = [node.faults for node in nodes if node.faults is not None]
+    for one in faults:
+        one.box.closed = True  # a load may go on pushing a drive that is off
+    for _ in range(RUN_OUT_NS // nodes[0].period_ns if faults else 0):
+        for node in nodes:
+            node.pass_time()
+
+
 class Node:
     """One emulated drive on a link."""
 
@@ -141,14 +151,17 @@ class Node:
                 self.sync(now)
             wake = min(next_beat, next_cycle) if self._pacing == "cyclic" else next_beat
             self._serve(min(max(wake - now, 0), IDLE_NS))
-        self._run_out()
+        run_out(self)
 
-    def _run_out(self) -> None:
-        """Lockstep with faults: a drive that is left alone meets its watchdog, as it would in real time."""
-        if self._faults is not None:
-            self._faults.box.closed = True  # a load may go on pushing a drive that is off
-            for _ in range(RUN_OUT_NS // self._period_ns):
-                self.pass_time()
+    @property
+    def period_ns(self) -> int:
+        """The loop's period."""
+        return self._period_ns
+
+    @property
+    def faults(self) -> PlantFaults | None:
+        """Its fault script or black box."""
+        return self._faults
 
     def _serve(self, timeout_ns: int) -> None:
         try:

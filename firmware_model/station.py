@@ -2,8 +2,8 @@
 
 :func:`attend` waits, and takes what is whole, valid and fresh: a SYNC moves the plant on and is answered at
 once, a command waits for the next SYNC. So it goes on until its time is over. Everything else (a frame that
-is damaged, repeated or of another identifier, an EMCY to be sent) it hands back untouched to the caller, who
-has the same rules in :mod:`firmware_model.house`; equality of the two is tested.
+is damaged, repeated or of another identifier, an EMCY to be sent) it hands back untouched to the caller. What
+is taken and how it is answered are the rules of :mod:`firmware_model.house`, which call it.
 """
 
 from __future__ import annotations
@@ -15,30 +15,37 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from drivers.binding import Bound
 from drivers.bus import Link, SocketLink
-from drivers.codec import Message
 from drivers.local import pack_frame
 from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, transmit, wait
-from drivers.tables import Tables, laid_out
 from drivers.wire import (
     CLASSIC_BYTES,
     DATA_AT,
     FD_BYTES,
     FRAME,
     MESSAGE,
-    REFUSED,
     SIGNAL,
-    encode,
     find,
     identifier,
-    is_valid,
-    phys_of,
 )
 from drivers.wire import STATE as WIRE_STATE
 from firmware_model.config import Record
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
-from firmware_model.house import FIRST_ANSWER, HouseFrames
+from firmware_model.house import (
+    CONTROLWORD,
+    COUNTER,
+    ENABLE,
+    LOAD,
+    STATUS,
+    T_L,
+    TAKEN,
+    U_D,
+    U_Q,
+    VOLTAGE,
+    HouseFrames,
+    accept,
+    lay_answers,
+)
 from firmware_model.jit import COMPILED, array_at, entry, jit, places_of, waiting
 from firmware_model.plant import PARAMS, SAMPLE, STATE
 
@@ -53,15 +60,6 @@ LAST_NS, STARTED, UNSENT, BEAT_NS, SYNC_ID, PERIOD_NS, MODE = range(7)
 the next heartbeat is due; of the configuration, the identifier of SYNC, the period of lockstep, 0 in real
 time, and the mode of a command."""
 NEVER_NS: Final = 2**62
-VOLTAGE, LOAD, STATUS = 1, 2, 4
-"""What a message carries, as bits."""
-_MODE, _CONTROLWORD, _U_Q, _U_D, _ENABLE, _T_L = range(1, 7)
-"""Places of a command's signals among the values; its counter has the first."""
-_COMMAND: Final = {
-    "Mode": _MODE, "Controlword": _CONTROLWORD, "VoltageQ": _U_Q, "VoltageD": _U_D,
-    "CurrentQ": _U_Q, "CurrentD": _U_D, "LoadEnable": _ENABLE, "LoadTorque": _T_L,
-}  # fmt: skip
-_LOAD: Final = {"Enable": _ENABLE, "LoadTorque": _T_L}
 F8, I8, U1, U4, I4 = (np.dtype(kind) for kind in ("f8", "i8", "u1", "u4", "i4"))
 ARRAYS: Final = {
     "params": PARAMS, "state": STATE, "sample": SAMPLE, "whole": I8, "real": F8, "fields": I8, "values": F8,
@@ -92,17 +90,15 @@ class Station:
         self.cells[SYNC_ID], self.cells[PERIOD_NS] = frames.sync_id or 0, period_ns
         self.cells[BEAT_NS] = NEVER_NS
         [(beat_id, beat, _)] = frames.beat()
-        self.raw = np.zeros(FD_BYTES + DATA_AT, np.uint8)
-        taken, sent, fields = _taken(frames), _sent(frames), _fields(frames)
-        heads = [laid_out(message.send_id, message.length, message.fd) for message, _ in frames.answers]
+        self.raw = frames.raw
         self._alive = {
             "params": params, "state": state, "sample": sample,
-            "whole": sample.view("i8"), "real": sample.view("f8"), "fields": fields,
-            "values": np.zeros(1 + max(len(fields) // 2, len(_COMMAND))),
-            "fds": link.fds, "times": np.zeros(4, np.int64), "cells": self.cells,
-            "counters": frames.counters, "raw": self.raw, "out": np.concatenate(heads),
-            "words": np.zeros(2, np.uint32), "wire": np.zeros(1, WIRE_STATE), "log": np.zeros(0, FRAME),
-            "taken": taken[0], "taken_signals": taken[1], "sent": sent[0], "sent_signals": sent[1],
+            "whole": sample.view("i8"), "real": sample.view("f8"), "fields": _fields(frames),
+            "values": frames.values, "fds": link.fds, "times": np.zeros(4, np.int64), "cells": self.cells,
+            "counters": frames.counters, "raw": frames.raw, "out": frames.out,
+            "words": frames.words, "wire": frames.wire_state, "log": frames.log,
+            "taken": frames.taken, "taken_signals": frames.taken_signals,
+            "sent": frames.sent, "sent_signals": frames.sent_signals,
             "beat": np.frombuffer(pack_frame(beat_id, beat), np.uint8),
         }  # fmt: skip
         places = places_of(self._alive, ARRAYS)
@@ -120,35 +116,9 @@ def station(
     return Station(link, frames, records, period_ns)
 
 
-def _taken(frames: HouseFrames) -> tuple[Record, Record]:
-    """(messages, signals) of what commands the drive, in the order of their counters."""
-    tables = Tables()
-    has = {name: place for name, place in _COMMAND.items() if name in frames.command.signals}
-    _add(tables, frames.command, has, VOLTAGE | (LOAD if frames.inline_load else 0))
-    if frames.load_command:
-        _add(tables, frames.load_command, _LOAD, LOAD)
-    return tables.records()
-
-
-def _sent(frames: HouseFrames) -> tuple[Record, Record]:
-    """(messages, signals) of what a SYNC is answered with; the values follow one another."""
-    tables, place = Tables(), 1
-    for message, fields in frames.answers:
-        sources = {name: place + index for index, name in enumerate(fields)}
-        _add(tables, message, sources, STATUS if message is frames.status else 0)
-        place += len(fields)
-    return tables.records()
-
-
-def _add(tables: Tables, message: Message, sources: dict[str, int], carries: int) -> None:
-    counter = "Counter" if "Counter" in message.signals else ""
-    rows = [(message.signals[name], 0, 0, source, False) for name, source in sources.items()]
-    tables.add(Bound(message, counter, ()), rows, carries)
-
-
 def _fields(frames: HouseFrames) -> npt.NDArray[np.int64]:
     """Word of the sample and whether it is a whole number, for each value from the second on."""
-    kinds = [SAMPLE.fields[name][:2] for _, fields in frames.answers for name in fields.values()]  # type: ignore[index]
+    kinds = [SAMPLE.fields[name][:2] for name in frames.fields]  # type: ignore[index]
     return np.array([(at // 8, kind.kind == "i") for kind, at in kinds], np.int64).ravel()
 
 
@@ -165,19 +135,12 @@ def send_answer(places: Any, status_due: int) -> bool:
     for place in range(len(fields) // 2):
         word = fields[2 * place]
         values[place + 1] = float(whole[word]) if fields[2 * place + 1] else real[word]
+    left_out = 0 if status_due else STATUS
+    if lay_answers(left_out, counters, messages, signals, values, out, words, wire, log) >= 0:
+        return False
     for index in range(len(messages)):
         m = messages[index]
-        if m["bit"] & STATUS and not status_due:
-            continue
-        if m["modulus"] > 0:
-            place = FIRST_ANSWER + index
-            counters[place] = (counters[place] + 1) % m["modulus"]
-            values[0] = counters[place]
-        if encode(out[index * FD_BYTES :], values, index, messages, signals, wire, words, log, 0) == REFUSED:
-            return False
-    for index in range(len(messages)):
-        m = messages[index]
-        if status_due or not m["bit"] & STATUS:
+        if not m["bit"] & left_out:
             size = FD_BYTES if m["fd"] else CLASSIC_BYTES
             cells[UNSENT] += transmit(fds, out[index * FD_BYTES :], size, wire, log) != DONE
     return True
@@ -218,22 +181,15 @@ def take_command(places: Any, index: int, now_ns: int) -> bool:
     values, words = array_at(places, _VALUES, F8), array_at(places, _WORDS, U4)
     p, s = array_at(places, _PARAMS, PARAMS)[0], array_at(places, _STATE, STATE)[0]
     cells, m = array_at(places, _CELLS, I8), messages[index]
-    if int(raw[4]) != m["length"] or not is_valid(raw, m):
+    if accept(raw, index, cells[MODE], counters, messages, signals, values, words) != TAKEN:
         return False
-    values[_MODE] = cells[MODE]
-    counter = int(phys_of(raw, m["length"], signals[m["first"]], words))
-    for place in range(m["first"] + 1, m["first"] + m["count"]):
-        values[signals[place]["source"]] = phys_of(raw, m["length"], signals[place], words)
-    if values[_MODE] != cells[MODE] or counter == counters[index]:
-        return False
-    counters[index] = counter
     if m["bit"] & VOLTAGE and cells[STARTED] and cells[PERIOD_NS] == 0:
         advance(p, s, now_ns - cells[LAST_NS])
         cells[LAST_NS] = now_ns
     if m["bit"] & LOAD:
-        on_load_command(s, values[_T_L] if values[_ENABLE] else 0.0)
+        on_load_command(s, values[T_L] if values[ENABLE] else 0.0)
     if m["bit"] & VOLTAGE:
-        on_command(s, counter, int(values[_CONTROLWORD]), values[_U_Q], values[_U_D])
+        on_command(s, int(values[COUNTER]), int(values[CONTROLWORD]), values[U_Q], values[U_D])
     return True
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 from collections import Counter
 from pathlib import Path
+from typing import Any, TypeVar
 
 from drivers.binding import bind
 from drivers.bus import Link, open_link
@@ -24,6 +25,8 @@ from hil.runtime.bus import bus_settings
 from hil.runtime.claim import claimed
 from hil.runtime.setup import Overrides, drive_map
 
+N = TypeVar("N", bound=Node)
+
 
 def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None) -> tuple[PlantConfig, Path]:
     """The plant that a run configuration names, and the folder of its file."""
@@ -33,40 +36,53 @@ def load_plant(path: Path, config: RunConfig, settings: list[str] | None = None)
     return load_toml(plant_path, PlantConfig, settings or []), plant_path.parent
 
 
+class Emulated:
+    """What a plant's file describes; ``frames``: what it speaks."""
+
+    def __init__(self, plant: PlantConfig, folder: Path, node_rule: str) -> None:
+        self._plant, self._database = plant, Database(folder / plant.dbc, plant.node_id, node_rule)
+        self._params = build_params(plant, wire_of(self._database, plant.protocol))
+        self._eds, self._acted = folder / plant.eds if plant.eds else None, Counter[int]()
+        self.frames = frames_of(self._database, plant.protocol, eds=(self._eds, {}) if self._eds else None)
+
+    def faulty(self, link: Link, lockstep: bool) -> FaultyLink:
+        """A link with the faults of its frames."""
+        faults, opener = self._plant.fault, self.frames.sync_id
+        return FaultyLink(link, self._database, faults, lockstep=lockstep, acted=self._acted, sync_id=opener)
+
+    def on(self, kind: type[N], link: Link, faulty: FaultyLink | None, config: RunConfig, **more: Any) -> N:
+        """A node of it on a link, through its faults."""
+        plant, faults = self._plant, None
+        if plant.fault or plant.black_box:
+            faults = PlantFaults(plant.fault, self._params, self.frames.counter_modulus - 1, self._acted)
+        node = kind(
+            faulty or link,
+            self._database,
+            self._params,
+            clock=config.loop.clock,
+            period_ns=config.loop.period_ns,
+            truth=plant.truth,
+            protocol=plant.protocol,
+            eds=self._eds,
+            faults=faults,
+            **more,
+        )
+        if faulty is not None:
+            faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
+        return node
+
+
 def make_node(path: Path, config: RunConfig, plant_settings: list[str]) -> tuple[Node, Link, str]:
     """Load everything, open the bus; return the node and a line that says what it is."""
     plant, folder = load_plants(path, {"": config}, plant_settings)[""]
-    database = Database(folder / plant.dbc, plant.node_id, config.drive.node_rule)
-    params = build_params(plant, wire_of(database, plant.protocol))
+    drive = Emulated(plant, folder, config.drive.node_rule)
+    if drive.frames.spoken is not None:
+        check_spoken(path, config, drive.frames.spoken)
     link: Link = open_link(bus_settings(config))
-    lockstep = config.loop.clock == "lockstep"
-    acted = Counter[int]()
-    eds = folder / plant.eds if plant.eds else None
-    frames = frames_of(database, plant.protocol, eds=(eds, {}) if eds else None)
-    if frames.spoken is not None:
-        check_spoken(path, config, frames.spoken)
-    faulty = None
-    if plant.fault:
-        opener = frames.sync_id
-        faulty = FaultyLink(link, database, plant.fault, lockstep=lockstep, acted=acted, sync_id=opener)
-    modulus = frames.counter_modulus
-    watched = plant.fault or plant.black_box
-    node = Node(
-        faulty or link,
-        database,
-        params,
-        clock=config.loop.clock,
-        pacing=plant.pacing,
-        period_ns=config.loop.period_ns,
-        truth=plant.truth,
-        protocol=plant.protocol,
-        eds=eds,
-        faults=PlantFaults(plant.fault, params, modulus - 1, acted) if watched else None,
-        every=plant.feedback_every,
-        ends_ticks=lockstep and config.feedback_every > 1 and faulty is None,
-    )
-    if faulty is not None:
-        faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
+    lockstep, every = config.loop.clock == "lockstep", plant.feedback_every
+    faulty = drive.faulty(link, lockstep) if plant.fault else None
+    ends = lockstep and config.feedback_every > 1 and faulty is None
+    node = drive.on(Node, link, faulty, config, pacing=plant.pacing, every=every, ends_ticks=ends)
     bus = config.bus
     motor = plant.motor.name or "inline"
     what = f"{bus.interface}:{bus.channel} node {plant.node_id}, motor {motor}, {config.loop.clock}"
@@ -115,28 +131,10 @@ def load_plants(
 
 def _coupled(plant: PlantConfig, folder: Path, link: Link, config: RunConfig, node_rule: str) -> Coupled:
     """One node of a bench, with its faults."""
-    database = Database(folder / plant.dbc, plant.node_id, node_rule)
-    params = build_params(plant, wire_of(database, plant.protocol))
-    eds = folder / plant.eds if plant.eds else None
-    faulty, faults, acted, tap = None, None, Counter[int](), Tap(link)
-    if plant.fault or plant.black_box:
-        frames = frames_of(database, plant.protocol, eds=(eds, {}) if eds else None)
-        faults = PlantFaults(plant.fault, params, frames.counter_modulus - 1, acted)
-        faulty = FaultyLink(tap, database, plant.fault, lockstep=False, acted=acted, sync_id=frames.sync_id)
-    node = Coupled(
-        faulty or link,
-        database,
-        params,
-        clock=config.loop.clock,
-        pacing="sync",
-        period_ns=config.loop.period_ns,
-        truth=plant.truth,
-        protocol=plant.protocol,
-        eds=eds,
-        faults=faults,
-    )
+    drive, tap = Emulated(plant, folder, node_rule), Tap(link)
+    faulty = drive.faulty(tap, False) if plant.fault or plant.black_box else None
+    node = drive.on(Coupled, link, faulty, config, pacing="sync")
     if faulty is not None:
-        faulty.now_ns, faulty.lost_sync = lambda: node.now_ns, node.pass_time
         node.faulty, node.tap = faulty, tap
     return node
 
