@@ -143,6 +143,45 @@ def transition_event(state: int, reason: int) -> tuple[str, str]:
     return ("stop", f"{name}: {Reason(reason).name}") if reason else ("state", name)
 
 
+class Course:
+    """What is logged of a drive besides its records, and how its run ends; ``of`` is before what is said.
+
+    Only of a drive alone, or the first, it is said that a stop ramps.
+    """
+
+    def __init__(self, t: Fields, ticks: TickArray, recorder: Recorder, of: str = "") -> None:
+        self._t, self._ticks, self._recorder, self._of = t, ticks, recorder, of
+        self._trouble = Trouble(self._say)
+        self._state, self._request = int(DriveState.SWITCH_ON_DISABLED), int(Request.ARM)
+        self.outcome, self.ended = Outcome(), False
+
+    def _say(self, t_ns: int, k: int, kind: str, text: str) -> None:
+        self._recorder.event(t_ns, k, kind, self._of + text)
+
+    def tell(self) -> None:
+        """Log what is new in this tick."""
+        t = self._t
+        if not is_news(t, self._state, self._request):
+            return
+        t_ns, k, state, request = t["t_ns"], t["k"], t["state"], t["request"]
+        if t["rx_flags"] & TROUBLE:
+            self._trouble.note(t_ns, k, t["rx_flags"])
+        if state != self._state:
+            self._say(t_ns, k, *transition_event(state, t["reason"]))
+        if request != self._request and request == RAMP_DOWN and not self._of:
+            self._say(t_ns, k, *RAMP_EVENT)
+        self._state, self._request = state, request
+
+    def conclude(self) -> None:
+        """Find out whether the run has ended, with the tick as it stands."""
+        t, outcome = self._t, self.outcome
+        if t["reason"]:
+            if outcome.stop is None:
+                outcome.stop = ticks_from(self._ticks.tobytes())  # .copy() goes field by field
+            outcome.state, outcome.reason = t["state"], t["reason"]
+            self.ended = t["state"] in ENDED
+
+
 class Loop:
     """A closed loop over a drive port. :meth:`run` returns after a safe stop, whatever happened.
 
@@ -171,14 +210,13 @@ class Loop:
         self._end = NEVER if plan.ticks is None else plan.ticks
         self._sends_sync = plan.pacing == "sync"
         self._t = Fields(ticks)
-        self._outcome, self._trouble = Outcome(), Trouble(recorder.event)
+        self._course = Course(self._t, ticks, recorder)
+        self._outcome = self._course.outcome
         pace = new_pace()
         self._pace: Any = pace.data
         self._start_ns = 0
         self._inbox, self._taken = inbox, 0
         self._number: Any = inbox.number if inbox else [0]
-        self._state = int(DriveState.SWITCH_ON_DISABLED)
-        self._requested = int(Request.ARM)
         self._tick: Any = ticks[0]
         drive.prepare(self._tick)
         self._whole = whole(pace)
@@ -292,28 +330,13 @@ class Loop:
 
     def _note(self) -> None:
         """Log what is new, then the record; find out whether the run has ended."""
-        t = self._t
-        if is_news(t, self._state, self._requested):
-            self._tell(t["t_ns"], t["k"], t["state"], t["request"])
+        t, course = self._t, self._course
+        course.tell()
         count(self._pace, t)
         self._recorder.tick(self._ticks)
         t["recorded_ns"] = bounded(self._clock.now_ns() - t["t_ns"])
-        if t["reason"]:
-            if self._outcome.stop is None:
-                self._outcome.stop = ticks_from(self._ticks.tobytes())  # .copy() goes field by field
-            self._outcome.state, self._outcome.reason = t["state"], t["reason"]
-            self._ended = t["state"] in ENDED
-
-    def _tell(self, deadline_ns: int, k: int, state: int, request: int) -> None:
-        """The events of a tick with news."""
-        t, event = self._t, self._recorder.event
-        if t["rx_flags"] & TROUBLE:
-            self._trouble.note(deadline_ns, k, t["rx_flags"])
-        if state != self._state:
-            event(deadline_ns, k, *transition_event(state, t["reason"]))
-        if request != self._requested and request == RAMP_DOWN:
-            event(deadline_ns, k, *RAMP_EVENT)
-        self._state, self._requested = state, request
+        course.conclude()
+        self._ended = course.ended
 
     def _newest_feedback(self, tick: Any) -> None:
         """Wait for cyclic feedback; of several that queued up the newest counts: :func:`wake`.

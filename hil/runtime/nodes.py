@@ -21,20 +21,18 @@ from hil.ports import Clock, Inbox
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, GUARD_NS, Words, guardian_flags
 from hil.runtime.loop import (
     BUS_DOWN,
-    ENDED,
     FULL,
     SEND_FAILED,
+    Course,
     Loop,
     Outcome,
     Plan,
     StopRequest,
     Whole,
     no_whole,
-    transition_event,
 )
 from hil.runtime.rules import DECIDED, DID, Fields, Pace, begin, bounded, stamp
-from hil.runtime.trouble import TROUBLE, Trouble
-from hil.signals import DriveState, Reason, Request, TickArray, ticks_from
+from hil.signals import Reason, Request, TickArray
 from hil.tick.pair import ask, leads, tell
 
 COUNTERS: Final = GUARD_NS + 1
@@ -89,8 +87,6 @@ class Axis:
         self.t = Fields(ticks)
         self.step = machine.looped()
         self.outcome = Outcome()
-        self.ended = False
-        self.noted = int(DriveState.SWITCH_ON_DISABLED)
         own = (machine.safety_state, machine.law_state, machine.setpoint_state)
         self._live = [state.view(np.uint8) for state in own]
         self._kept = [live.copy() for live in self._live]
@@ -115,15 +111,6 @@ class Axis:
             live[:] = kept
         self.t["request"] = NODE_STOPPED
         self.step(self.ticks)
-
-    def conclude(self) -> None:
-        """Find out whether this node's run has ended."""
-        t, outcome = self.t, self.outcome
-        if t["reason"]:
-            if outcome.stop is None:
-                outcome.stop = ticks_from(self.ticks.tobytes())
-            outcome.state, outcome.reason = t["state"], t["reason"]
-            self.ended = t["state"] in ENDED
 
 
 class Together:
@@ -211,15 +198,9 @@ class NodesLoop(Loop):
         super().__init__(
             self._together, clock, recorder, first.step, first.ticks, plan, request, whole, inbox
         )
-        self._troubles = [Trouble(self._teller(axis)) for axis in self._more]
-
-    def _teller(self, axis: Axis) -> Any:
-        """Events of a node after the first, with its name."""
-
-        def tell(t_ns: int, k: int, kind: str, text: str) -> None:
-            self._recorder.event(t_ns, k, kind, f"{axis.name}: {text}")
-
-        return tell
+        self._others = [Course(axis.t, axis.ticks, recorder, f"{axis.name}: ") for axis in self._more]
+        for axis, course in zip(axes, (self._course, *self._others), strict=True):
+            axis.outcome = course.outcome
 
     def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
         """A tick of all nodes, each of which has feedback in every tick."""
@@ -313,16 +294,10 @@ class NodesLoop(Loop):
     def _note(self) -> None:
         """Log what is new of each node, then the records."""
         super()._note()
-        for axis, trouble in zip(self._more, self._troubles, strict=True):
-            t = axis.t
-            if t["rx_flags"] & TROUBLE:
-                trouble.note(t["t_ns"], t["k"], t["rx_flags"])
-            if t["state"] != axis.noted:
-                axis.noted = t["state"]
-                kind, text = transition_event(axis.noted, t["reason"])
-                self._recorder.event(t["t_ns"], t["k"], kind, f"{axis.name}: {text}")
+        for course in self._others:
+            course.tell()
         self._rings.more_ticks()
-        for axis in self._axes:
+        for axis, course in zip(self._more, self._others, strict=True):
             axis.t["recorded_ns"] = self._t["recorded_ns"]
-            axis.conclude()
-        self._ended = all(axis.ended for axis in self._axes)
+            course.conclude()
+        self._ended = all(course.ended for course in (self._course, *self._others))
