@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,7 @@ from hil.errors import HilError
 from hil.runtime.setup import Overrides, Setup
 from hil.tuning.bench import bench_of, findings_of, lsb_of, spec_in, speed_drive, takes_voltage
 from hil.tuning.families import Family, family, toml
-from hil.tuning.measure import Bench, margins, noise_text, quiet
+from hil.tuning.measure import Bench, Elastic, margins, noise_text, quiet
 from hil.tuning.optimise import Limits, Tuned, law_of, spec_of, tune
 from hil.tuning.windows import figures, own_loop_figures
 
@@ -128,12 +128,9 @@ def design(
     setup = speed_drive(path, overrides)
     base, own = spec_in(setup), not takes_voltage(setup)
     bench = bench_of(path, setup, given, spread=spread, shafts=wish.shafts(SEARCHED_HZ))
-    aim = "noise" if wish.aims_at_noise else "iae"
     limits, families = wish.limits(setup), [family(name, own) for name in wish.laws]
     with ProcessPoolExecutor() as pool:
-        jobs = [pool.submit(_tune, f, bench, limits, base, wish.effort, aim, None) for f in families]
-        best = _best([job.result() for job in jobs], wish.aims_at_noise, bench.unit)
-        best = _on_the_shafts(best, bench, base, wish, limits)
+        best = _holding(families, bench, base, wish, limits, pool)
         free = wish.aims_at_noise or "u_noise" not in best.limits_it
         at = best.verdict.u_noise if free else limits.u_noise
         budgets = [
@@ -145,6 +142,28 @@ def design(
     found = _result(best, front, spec, bench, np.array(lsb_of(setup)))
     found |= {"config": str(path), "wish": asdict(wish), "findings": findings_of(setup)}
     return found, best
+
+
+def _holding(
+    families: Sequence[Family], bench: Bench, base: LawSpec, wish: Wish, limits: Limits,
+    pool: ProcessPoolExecutor,
+) -> Tuned:  # fmt: skip
+    """The best of the families, made to hold on the shafts.
+
+    While the last family is searched that is begun with the best of the others, which mostly stays the best.
+    """
+    aim, noise = "noise" if wish.aims_at_noise else "iae", wish.aims_at_noise
+    jobs = [pool.submit(_tune, f, bench, limits, base, wish.effort, aim, None) for f in families[::-1]]
+    ahead: tuple[Tuned, Future[Tuned]] | None = None
+    for _ in as_completed(jobs):
+        found = [job.result() for job in jobs[::-1] if job.done()]
+        if len(found) == len(jobs) - 1 and any(one.feasible for one in found):
+            early = _best(found, noise, bench.unit)
+            ahead = early, pool.submit(_on_the_shafts, early, bench, base, wish, limits)
+    best = _best([job.result() for job in jobs[::-1]], noise, bench.unit)
+    if ahead and best.family is ahead[0].family:
+        return ahead[1].result()
+    return _on_the_shafts(best, bench, base, wish, limits)
 
 
 def _on_the_shafts(best: Tuned, bench: Bench, base: LawSpec, wish: Wish, limits: Limits) -> Tuned:
@@ -167,7 +186,7 @@ def _on_the_shafts(best: Tuned, bench: Bench, base: LawSpec, wish: Wish, limits:
     return best
 
 
-def _unstable(best: Tuned, bench: Bench, base: LawSpec, wish: Wish) -> list[tuple[float, float, float]]:
+def _unstable(best: Tuned, bench: Bench, base: LawSpec, wish: Wish) -> list[Elastic]:
     """The shafts on which it is unstable in a corner, on a finer grid and for longer than the search."""
     law = law_of(best.tables, base, bench.T_s)
     fine = [

@@ -136,15 +136,16 @@ def respond_all(p: Any, s: Any, A: Array, b: Array, e: Array, kinds: Any, out: A
             respond(p, s, A[m], b[m], e[m], kinds[j], out[m, j])
 
 
-def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array) -> tuple[Array, Array]:
-    """A (n, n), B (n, 3) of (dw, i_q, ..., i_d) about the speed w: x+ = A x + B (u_q, u_d, 1).
+def turning(motor: MotorModel, T_s: float, w: float, mechanics: Array, load: Array) -> tuple[Array, Array]:
+    """A (n, n), B (n, 4) of (dw, i_q, ..., i_d) about the speed w: x+ = A x + B (u_q, u_d, 1, T_L).
 
-    ``mechanics`` is A of :func:`one_mass` or :func:`two_masses`; with omega = n_p w the axes are coupled by
+    ``mechanics``, ``load`` are those of :func:`one_mass` or :func:`two_masses`; with omega = n_p w the axes
+    are coupled by
         L_q di_q/dt = u_q - .. - omega (L_d i_d + psi_f),  L_d di_d/dt = u_d - R_s i_d + omega L_q i_q
     """
     n, omega = len(mechanics) + 1, motor.n_p * w
-    whole = np.zeros((n + 3, n + 3))
-    whole[: n - 1, : n - 1] = mechanics
+    whole = np.zeros((n + 4, n + 4))
+    whole[: n - 1, : n - 1], whole[: n - 1, n + 3] = mechanics, load
     whole[1, n - 1], whole[1, n], whole[1, n + 2] = (
         np.array([-omega * motor.L_d, 1, -omega * motor.psi_f]) / motor.L_q
     )
@@ -200,6 +201,32 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool,
                 out[kind, 2, at] = (x[n - 1] - out[kind, 2, at]) / SMALL[kind]
             q, d = u_q + pulse * (kind == 3), u_d + pulse * (kind == 4)
             move(A, B, q, d, 1.0, x, new)
+            u_q, u_d = s["u"][1], s["u"][2]
+
+
+@jit
+def respond_loaded(p: Any, s: Any, A: Array, B: Array, w: float, load: float, out: Array) -> None:
+    """dw (K,) after a step of the load [N m] on a motor that runs at w (:func:`turning`), axes coupled.
+
+    What the loop does without it (a shaft rings, a motor that is off) is taken off tick by tick.
+    """
+    n, rest = A.shape[0], SETTLED * max(p["N"][0], p["N"][1], 50)
+    x, new = np.empty(n), np.empty(n)
+    for size in range(2):
+        reset(s)
+        x[:] = 0.0
+        u_q, u_d = -B[1, 2] / B[1, 0], 0.0  # against the back-EMF
+        apply(s, 0.0, u_q, u_d)
+        for k in range(-rest, len(out)):
+            observe(p, s, w + x[0], x[1], x[n - 1], True, 1)
+            apply(s, 0.0, u_q, u_d)
+            command(p, s, w, 0.0, 0.0, NO_LIMIT)
+            if k >= 0:
+                out[k] = x[0] - (out[k] if size else 0.0)
+            move(A, B, u_q, u_d, 1.0, x, new)
+            if size and k >= 0:
+                for r in range(n):
+                    x[r] += B[r, 3] * load
             u_q, u_d = s["u"][1], s["u"][2]
 
 

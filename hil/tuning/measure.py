@@ -33,6 +33,7 @@ from hil.tuning.loop import (
     Record,
     one_mass,
     respond_all,
+    respond_loaded,
     respond_turning,
     rigid,
     shaft,
@@ -334,7 +335,13 @@ def on_shaft(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, r
 
 
 def ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> Array:
-    """The speed after the load step (ticks,)."""
+    """The speed after the load step (ticks,); of a drive by voltage at the bench's speed, axes coupled."""
+    if bench.inner is None:
+        own, out = _free(law), _buffer((bench.ticks,))
+        plant = _turning(motor, bench.T_s, bench.w_0, at or bench.known, bench.brake)
+        with np.errstate(over="ignore", invalid="ignore"):
+            respond_loaded(own[0], _state()[0], *plant, bench.w_0, bench.load, out)
+        return out
     stepped = to_unit_load(law, bench.load) if adapts(law) else law
     plant = bench.plant(motor, at)
     w: Array = (
@@ -381,9 +388,11 @@ def quiet(
 
 
 @functools.lru_cache(4096)
-def _turning(motor: MotorModel, T_s: float, w: float, at: Elastic | None) -> tuple[Array, Array]:
+def _turning(
+    motor: MotorModel, T_s: float, w: float, at: Elastic | None, brake: bool = False
+) -> tuple[Array, Array]:
     """:func:`hil.tuning.loop.turning` in one place."""
-    return turning(motor, T_s, w, (two_masses(motor, *at) if at else one_mass(motor))[0])
+    return turning(motor, T_s, w, *(two_masses(motor, *at, brake) if at else one_mass(motor)))
 
 
 def _vibrations(law: Record, bench: Bench, places: Sequence[Place], ticks: int, w: float) -> Array:

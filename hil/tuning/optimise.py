@@ -86,6 +86,7 @@ class _Search:
     best: float = math.inf
     corners: list[Plant] = field(default_factory=list)
     seen: dict[tuple[float, ...], float] = field(default_factory=dict)
+    calm: set[tuple[float, ...]] = field(default_factory=set)
     nominal: Plant = field(init=False)
     every: list[Plant] = field(init=False)
     shafts: list[Place] = field(init=False)
@@ -108,10 +109,18 @@ class _Search:
 
     def cost(self, y: Array) -> float:
         """Worst IAE in the corners looked at; 10 and more for what breaks a limit, by how much."""
-        key = tuple(np.round(self.numbers(y), 9))
+        key = self.key(y)
         if key not in self.seen:
             self.seen[key] = self._cost(y)
         return self.seen[key]
+
+    def key(self, y: Array) -> tuple[float, ...]:
+        """What tells one candidate from another."""
+        return tuple(np.round(self.numbers(y), 9))
+
+    def is_calm(self, y: Array) -> bool:
+        """Whether no shaft makes it vibrate; of what the search took for its best it is known."""
+        return self.key(y) in self.calm or all(quiet(self.law(y), self.bench, self.shafts))
 
     def _cost(self, y: Array) -> float:
         try:
@@ -140,6 +149,7 @@ class _Search:
             if not all(calm):
                 return 20.0 + 10.0 * calm.count(False) / len(calm)
             self.best = value
+            self.calm.add(self.key(y))
         return value
 
     def _over(self, u: float, nominal: Any, worst: Any) -> float:
@@ -219,7 +229,7 @@ def tune(
     law = search.law(y)
     verdict = judge(law, bench)
     used = _use(verdict, limits)
-    calm = not search.shafts or all(quiet(law, bench, search.shafts))
+    calm = search.is_calm(y)
     near = tuple(name for name, share in used.items() if share > 0.985)
     return Tuned(
         family,
