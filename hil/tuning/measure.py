@@ -338,9 +338,9 @@ def ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) ->
     """The speed after the load step (ticks,); of a drive by voltage at the bench's speed, axes coupled."""
     if bench.inner is None:
         own, out = _free(law), _buffer((bench.ticks,))
-        plant = _turning(motor, bench.T_s, bench.w_0, at or bench.known, bench.brake)
+        A, B = _turning(motor, bench.T_s, bench.w_0, at or bench.known, bench.brake)
         with np.errstate(over="ignore", invalid="ignore"):
-            respond_loaded(own[0], _state()[0], *plant, bench.w_0, bench.load, out)
+            respond_loaded(own[0], _state()[0], A, B, bench.w_0, bench.load, out)
         return out
     stepped = to_unit_load(law, bench.load) if adapts(law) else law
     plant = bench.plant(motor, at)
