@@ -19,7 +19,7 @@ from drivers.kernel import InterfaceFacts, interface_facts
 from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
 from hil.check.filtered import filter_rows
-from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row
+from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row, sync_rows
 from hil.check.seldom import seldom_rows
 from hil.check.shaft import shaft_rows
 from hil.config.limits import LimitsTable
@@ -63,6 +63,7 @@ def check(setup: Setup) -> list[Row]:
         *heard_rows(setup),
         *canopen_rows(setup),
         *realtime_rows(config.realtime),
+        *sync_rows(config.bus, config.realtime.cpu),
         clock_row(config.loop.period_ns),
         disk_row(log_path(setup, "check"), needed_bytes(config)),
     ]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
 import time
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from hil.config.loop import RealtimeTable
+from hil.config.loop import BusTable, RealtimeTable
 from hil.errors import HilError
 from hil.log.recorder import check_folder
 from hil.runtime import realtime
@@ -16,6 +19,10 @@ Verdict = Literal["pass", "warn", "fail"]
 CLOCK_SOURCE = Path("/sys/devices/system/clocksource/clocksource0/current_clocksource")
 SLOW_CLOCKS = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
 WAKEUPS = 100
+INLINE_SINCE = (6, 5)
+"""Linux runs softirqs after an interrupt although ksoftirqd is runnable (commit d15121be7485)."""
+_POLICY_AT = 38
+"""Of what follows the name in /proc/PID/stat; proc(5) counts from the process number, and from 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +60,39 @@ def clock_row(period_ns: int, source: Path = CLOCK_SOURCE) -> Row:
         return Row("clock", "warn", found, "boot with a fast clock source (clocksource=tsc on x86)")
     remedy = "an idle machine, the performance governor, a core of its own ([realtime] cpu)"
     return row("clock", worst < period_ns // 2, found, remedy, "warn")
+
+
+def sync_rows(bus: BusTable, cpu: int | None) -> list[Row]:
+    """What a SYNC by the kernel needs, on the loop's core or on each that the loop may be on."""
+    if bus.sync != "kernel":
+        return []
+    return [softirq_row(os.sched_getaffinity(0) if cpu is None else [cpu])]
+
+
+def softirq_row(cores: Iterable[int], release: str | None = None, proc: Path = Path("/proc")) -> Row:
+    """Can a load delay a SYNC by the kernel? A softirq sends it, which may have to wait for ksoftirqd."""
+    said = release or os.uname().release
+    known = re.match(r"(\d+)\.(\d+)", said)
+    if known and tuple(map(int, known.groups())) >= INLINE_SINCE:
+        return Row("softirqs", "pass", f"Linux {said} runs them at once")
+    policies = softirq_policies(proc)
+    waiting = sorted(core for core in cores if policies.get(core) not in (os.SCHED_FIFO, os.SCHED_RR))
+    found = f"Linux {said}: ksoftirqd under FIFO" + (f" but on {waiting}" if waiting else "")
+    remedy = "; ".join(f"chrt -f -p 1 $(pgrep -x ksoftirqd/{core})" for core in waiting)
+    return row("softirqs", not waiting, found, f"else a load makes SYNC late: {remedy}", "warn")
+
+
+def softirq_policies(proc: Path) -> dict[int, int]:
+    """Scheduling policy of each core's ksoftirqd."""
+    seen = {}
+    for path in proc.glob("[0-9]*/stat"):
+        try:
+            head, _, rest = path.read_text(encoding="ascii", errors="replace").rpartition(") ")
+        except OSError:  # it has gone meanwhile
+            continue
+        if (name := head.partition("(")[2]).startswith("ksoftirqd/"):
+            seen[int(name.partition("/")[2])] = int(rest.split()[_POLICY_AT])
+    return seen
 
 
 def _lateness_ns() -> int:

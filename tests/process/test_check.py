@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import select
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,7 +17,7 @@ from drivers.kernel import InterfaceFacts
 from drivers.listen import Heard, Traffic
 from drivers.local import open_sockets
 from hil.check.checks import bus_rows, interface_rows, load_row, passed, traffic_rows
-from hil.check.preflight import Row, clock_row, disk_row
+from hil.check.preflight import Row, clock_row, disk_row, softirq_policies, softirq_row, sync_rows
 from hil.config.loop import BusTable
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.sim.demo import emulator_process
@@ -288,6 +289,31 @@ def test_damaged_frames_and_counter_jumps_on_a_bus(configs: Path, settings: Sett
     heard = traffic.of("FEEDBACK")
     assert (heard.count, heard.invalid, heard.jumps) == (7, 2, 2)
     assert heard.values["Speed"] == 1.5 and traffic.foreign == 1 and traffic.error_frames == 1
+
+
+def test_a_sync_by_the_kernel_wants_softirqs_that_do_not_wait(tmp_path: Path) -> None:
+    """Before Linux 6.5 they wait for ksoftirqd, which waits for its turn unless it is under FIFO (1)."""
+    for pid, (name, policy) in enumerate({"ksoftirqd/0": 1, "ksoftirqd/1": 0, "an (odd) name": 1}.items()):
+        folder = tmp_path / str(pid)
+        folder.mkdir()
+        numbers = " ".join(["0"] * 37)
+        (folder / "stat").write_text(f"{pid} ({name}) S {numbers} {policy} 0 0")
+    assert softirq_row([0], "6.1.0-56-amd64", tmp_path).verdict == "pass"
+    found = softirq_row([0, 1, 2], "6.1.0-56-amd64", tmp_path)
+    assert found.verdict == "warn" and found.found.endswith("ksoftirqd under FIFO but on [1, 2]")
+    assert "chrt -f -p 1 $(pgrep -x ksoftirqd/1); chrt" in found.remedy
+    assert softirq_row([1], "6.5.1", tmp_path).verdict == "pass"
+    assert softirq_row([1], "6.12.0", tmp_path).verdict == "pass"
+
+
+def test_the_kernels_threads_are_found() -> None:
+    """In a container there may be none to see."""
+    assert set(softirq_policies(Path("/proc"))) <= set(range(os.cpu_count() or 1))
+
+
+def test_sync_by_the_loop_asks_nothing_of_softirqs() -> None:
+    assert sync_rows(BusTable(), None) == []
+    assert [row.check for row in sync_rows(BusTable(sync="kernel"), 0)] == ["softirqs"]
 
 
 def test_clock_and_disk(tmp_path: Path) -> None:

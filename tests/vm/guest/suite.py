@@ -125,6 +125,35 @@ def vcan_kernel_sync() -> None:
         s.start()
 
 
+def sync_beside_a_load() -> None:
+    """The loop's SYNC and the kernel's, each beside a load on the one core; softirqs do not wait."""
+    if not IN_MACHINE:
+        (OUT / "sync_beside_a_load.skipped").touch()
+        return
+    ksoftirqd = sh("pgrep", "-x", "ksoftirqd/0").strip()
+    sh("chrt", "-f", "-p", "1", ksoftirqd)
+    for name, settings in (("loaded_loop", ()), ("loaded_kernel", KERNEL)):
+        with Scenario(name, settings=settings) as s:
+            s.start()
+            s.running()
+            load = Forked(s.folder / "load.txt", packets_to_itself)
+            (s.folder / "marks.json").write_text(json.dumps({"loaded": time.time()}))
+            s.run.wait()
+            load.send_signal(signal.SIGKILL)
+            load.wait()
+    sh("chrt", "-o", "-p", "0", ksoftirqd)
+
+
+def packets_to_itself() -> int:
+    """Keeps the kernel busy: system calls, and a softirq for each packet that comes in."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as own:
+        own.bind(("127.0.0.1", 0))
+        own.connect(own.getsockname())
+        while True:
+            own.send(bytes(1200))
+            own.recv(1200)
+
+
 def kernel_sync_ends_with_its_process() -> None:
     """The drive's watchdog is off, and there is no guardian: the job dies with the controller alone."""
     own = (*KERNEL, "guardian.enabled=false")
@@ -444,6 +473,7 @@ def main() -> int:
         vcan_8_khz,
         vcan_without_fifo,
         vcan_kernel_sync,
+        sync_beside_a_load,
         kernel_sync_ends_with_its_process,
         kernel_sync_of_a_stopped_process,
         kernel_sync_of_a_stopped_process_ends_by_the_watchdog,
