@@ -209,6 +209,7 @@ def _started(client: BusDrive | None) -> Iterator[None]:
         yield
         return
     client.start()
+    client.flush()  # into the log before the loop makes its tick ready in the same room
     try:
         yield
     finally:

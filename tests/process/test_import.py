@@ -114,6 +114,29 @@ def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name
     assert replay(tmp_path / "back.mcap").verdict == "same"
 
 
+def test_a_drive_with_start_frames_comes_back(tmp_path: Path) -> None:
+    """They are in its log, each once, before the first tick and in the order of their stamps."""
+    one = ran(tmp_path, "odrive.toml", "import-odrive", "loop.duration_s=1.0")
+    log = open_log(one.log)
+    sent = [frame for frame in log.frames if not frame.received]
+    assert [frame.can_id for frame in sent[:2]] == [0x38, 0x2B], "Clear_Errors, Set_Controller_Mode"
+    stamps = [frame.t_ns for frame in sent[:2]]
+    assert stamps == sorted(stamps) and stamps[1] < int(log.ticks["t_ns"][0])
+    export(one.log, tmp_path / "a.log")
+    found = import_recording(tmp_path / "a.log", tmp_path / "back.mcap", one.config, one.settings)
+    assert found.commands == OURS and found.damage is None, found
+    assert replay(tmp_path / "back.mcap").verdict == "same"
+
+
+def test_a_drive_that_its_command_asks_is_refused(steady: Ran, tmp_path: Path) -> None:
+    """In one line, and nothing is written."""
+    recording, back = tmp_path / "a.log", tmp_path / "back.mcap"
+    export(steady.log, recording, frames=True)
+    with pytest.raises(LogError, match=r"moteus.toml: drive.signals.poll: a recording .* can't be") as caught:
+        import_recording(recording, back, CONFIGS / "moteus.toml", ())
+    assert "\n" not in str(caught.value) and not back.exists()
+
+
 @pytest.fixture(scope="module")
 def other_protocol(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """A drive of another protocol: big endian, extended identifiers, CAN FD, no SYNC."""
