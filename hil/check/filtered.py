@@ -29,7 +29,7 @@ def filter_rows(setup: Setup, real: Any = None, w_noise: float = 0.0) -> list[Ro
     ``w_noise`` [rad/s] is what its sensor adds to the resolution of the frames.
     """
     config, told = setup.config, setup.config.drive.speed_filter
-    if config.drive.takes == "voltage":
+    if config.drive.takes == "voltage" or not config.follows_speed:
         return []
     real = real or told
     try:

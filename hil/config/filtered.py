@@ -26,7 +26,9 @@ def loop_through(config: RunConfig, machine: Machine, given: SpeedFilter | None)
 
     inner, T_s = inner_loop(config, bool(machine.law["told"][0])), 1.0 / config.loop.rate_hz
     assert inner is not None  # noqa: S101 - asked of no other drive
-    return loop_of(machine.law, shaft_of(motor_model(config.motor), inner, given, T_s), T_s)
+    law = machine.law.copy()
+    law["pair"] = 0  # of one law over two nodes: their net command is the law speed's
+    return loop_of(law, shaft_of(motor_model(config.motor), inner, given, T_s), T_s)
 
 
 def refuse_unstable(where: str, config: RunConfig, machine: Machine, w_lsb: float) -> None:
@@ -37,9 +39,9 @@ def refuse_unstable(where: str, config: RunConfig, machine: Machine, w_lsb: floa
     table = config.drive.speed_filter
     given = speed_filter(table, config.loop.rate_hz)
     every, shaft = config.feedback_every, config.motor.shaft
-    if (given is None and every == 1 and shaft is None) or machine.law["rows"][
-        0
-    ]:  # an experiment closes no loop
+    if (
+        (given is None and every == 1 and shaft is None) or not config.follows_speed or machine.law["rows"][0]
+    ):  # an experiment closes no loop
         return
     loop, command = loop_through(config, machine, given), config.command
     if not loop.stable and every > 1:

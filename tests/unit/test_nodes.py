@@ -22,6 +22,7 @@ from firmware_model.drive import advance
 from firmware_model.plant import ANGLE, State
 from firmware_model.registry import PlantError
 from firmware_model.shaft import advance_both, couple, refuse_uncoupled
+from hil.check.filtered import filter_rows
 from hil.config.nodefile import load_nodes
 from hil.config.tables import RunConfig, load_toml
 from hil.control.errors import ControlDesignError
@@ -439,3 +440,13 @@ def test_one_file_is_read_node_by_node(logged: Path) -> None:
     assert (first.metadata["run"]["kind"], load.metadata["run"]["kind"]) == ("run", "own")
     assert (first.result["ended"], load.result["ended"], load.result["ticks"]) == ("a", "b", 3)
     assert first.nodes == load.nodes == ("motor", "load")
+
+
+def test_the_check_judges_the_loop_of_both_as_one() -> None:
+    """With the pole and window of dyno.toml its margins are the same; a commanded torque has no loop."""
+    (speed, torque), (fac, follow) = (
+        [filter_rows(one) for one in load_node_setups(path, Overrides()).values()]  # type: ignore[union-attr]
+        for path in (DYNO, FAC)
+    )
+    assert fac == speed and fac[0].verdict == "pass" and "Ms 1.59" in fac[0].found
+    assert torque == follow == []
