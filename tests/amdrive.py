@@ -28,7 +28,102 @@ SLOT = 16 * (NODE % 4)
 LOAD_N_M, LOAD_S = 4.0, 0.5
 SAG_S = 1.0
 """When the supply falls to 20 V, of a drive that is told to trip."""
+BIT = 8 * SLOT
 UPLOAD = {1: 0x4F, 2: 0x4B, 4: 0x43}
+
+DBC = f"""VERSION "1"
+NS_ :
+BS_:
+BU_: Controller Drive
+BO_ {GROUP} GROUP: 64 Controller
+ SG_ Torque : {BIT + 48}|16@1- (0.01,0) [-327.68|327.67] "Nm" Drive
+ SG_ Enable : {BIT + 96}|1@1+ (1,0) [0|1] "" Drive
+ SG_ FaultReset : {BIT + 98}|1@1+ (1,0) [0|1] "" Drive
+ SG_ Mode : {BIT + 100}|4@1+ (1,0) [0|15] "" Drive
+ SG_ Counter : {BIT + 104}|8@1+ (1,0) [0|255] "" Drive
+BO_ {ANSWER} ANSWER: 16 Drive
+ SG_ Velocity : 32|16@1- (0.01,0) [-327.68|327.67] "rad/s" Controller
+ SG_ State : 80|3@1+ (1,0) [0|7] "" Controller
+ SG_ Limited : 86|1@1+ (1,0) [0|1] "" Controller
+ SG_ Echo : 96|8@1+ (1,0) [0|255] "" Controller
+ SG_ Winding : 104|8@1+ (1,-40) [-40|215] "degC" Controller
+ SG_ Supply : 112|16@1+ (0.01,0) [0|655.35] "V" Controller
+BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN","StandardCAN_FD","ExtendedCAN_FD";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN_FD";
+"""
+
+CONFIG = f"""[loop]
+rate_hz = 1000
+pacing = "sync"
+clock = "lockstep"
+duration_s = 1.4
+[bus]
+interface = "hil-local"
+channel = "am"
+fd = true
+data_bitrate = 5000000
+[drive]
+dbc = "am.dbc"
+torque_constant_n_m_a = {K_T}
+current_limit_a = 27.0
+speed_filter = {{ kind = "first-order", pole_rad_s = 1885.0 }} # its vel_filter_hz, 300
+[drive.signals]
+poll = "GROUP"
+speed = "ANSWER.Velocity"
+state = "ANSWER.State"
+limited = "ANSWER.Limited"
+echo = "ANSWER.Echo"
+temperature_motor = "ANSWER.Winding"
+v_dc = "ANSWER.Supply"
+torque_ref = "GROUP.Torque"
+enable = "GROUP.Enable"
+reset = "GROUP.FaultReset"
+counters = ["GROUP.Counter"]
+[drive.signals.states] # one bit enables it; it walks the states between by itself
+0 = "off"
+1 = "off"
+2 = "off"
+3 = "off"
+4 = "operation enabled"
+5 = "quick stop active"
+6 = "fault reaction active"
+7 = "fault"
+[drive.signals.constants]
+"GROUP.Mode" = 1 # CST
+[motor] # its torque constant is 1.5 n_p psi_f, at the output
+R_s_ohm = 1.0
+L_d_h = 1e-3
+L_q_h = 1e-3
+psi_f_wb = {K_T / 31.5}
+n_p = 21
+J_kg_m2 = {J}
+B_f_n_m_s = 0.0
+[controller]
+kind = "speed"
+speed_pole_rad_s = 30.0
+[observer.speed]
+kind = "ftdob"
+gamma_1_rad_s = 25.0
+gamma_2_rad_s = 58.0
+delay_ms = 12.0
+[limits]
+w_max_rad_s = 10.0
+i_max_a = 12.0
+i_trip_a = 25.0
+dtorque_max_n_m = 20.0
+v_dc_min_v = 40.0
+v_dc_max_v = 55.0
+temperature_max_c = 120.0
+i_continuous_a = 12.0
+i2t_max_a2s = 400.0
+[reference]
+kind = "s-curve"
+w_rad_s = 5.0
+rate_rad_s2 = 20.0
+jerk_rad_s3 = 1000.0
+at_s = 0.05
+down_at_s = 1.1
+"""
 
 
 def load(t: float, _q: float, _qd: float) -> float:
@@ -79,10 +174,16 @@ def serve(link: Link, drive: Drive, stopped: Callable[[], bool]) -> None:
             link.send(*answer, len(answer[1]) > 8)
 
 
-if __name__ == "__main__":
+def main(channel: str, interface: str = "hil-local", trips: bool = False) -> int:
+    """The drive on a bus until SIGTERM."""
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
-    channel = open_link(BusSettings("hil-local", sys.argv[1], fd=True))
+    link = open_link(BusSettings(interface, channel, fd=True))
     print("ready", flush=True)
-    serve(channel, Drive("trips" in sys.argv), over.is_set)
-    channel.close()
+    serve(link, Drive(trips), over.is_set)
+    link.close()
+    return 0
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], trips="trips" in sys.argv)

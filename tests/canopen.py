@@ -21,9 +21,9 @@ from firmware_model.node import Node, wire_of
 from hil.config.tables import RunConfig, load_toml
 from hil.runtime.configure import Job, job_of
 from tests.conftest import CONFIGS, ROOT
+from tests.durand402 import config_of
 
 NODE = 5
-OWN = ("tpdo", "rpdo_timeout_ms", "load_true", "[drive.signals.units]")
 PATIENT = "canopen.answer_timeout_s=5.0"
 """A busy machine lets a thread wait."""
 EDS = CONFIGS / "drives" / "cia402.eds"
@@ -39,8 +39,8 @@ def run_config(configs: Path) -> Path:
     """The shipped configuration, every object by the mode alone."""
     path = configs / "canopen.toml"
     if not path.exists():
-        lines = (configs / "cia402.toml").read_text(encoding="utf-8").splitlines(keepends=True)
-        path.write_text("".join(line for line in lines if not line.startswith(OWN)), encoding="utf-8")
+        shipped = (configs / "cia402.toml").read_text(encoding="utf-8")
+        path.write_text(config_of(shipped), encoding="utf-8")
     return path
 
 

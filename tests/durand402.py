@@ -104,10 +104,18 @@ class Drive:
         self.od.write(0x6041, 0, WORDS[self.state])
 
 
-def serve(channel: str, eds: Path, stopped: Callable[[], bool]) -> None:
-    """A drive on a channel of hil-local until it is to stop; its EDS, as durand makes it, goes to a file."""
+OWN = ("tpdo", "rpdo_timeout_ms", "load_true", "[drive.signals.units]")
+
+
+def config_of(shipped: str) -> str:
+    """The shipped configuration without what durand's drive has not: objects by the mode alone."""
+    return "".join(line for line in shipped.splitlines(keepends=True) if not line.startswith(OWN))
+
+
+def serve(channel: str, eds: Path, stopped: Callable[[], bool], interface: str = "hil-local") -> None:
+    """A drive on a bus until it is to stop; its EDS, as durand makes it, goes to a file."""
     durand.set_scheduler(clock := VirtualScheduler())
-    link = open_link(BusSettings("hil-local", channel))
+    link = open_link(BusSettings(interface, channel))
     wire = Wire(link)
     drive = Drive(wire)
     eds.write_text(drive.node.eds.content, encoding="utf-8")
@@ -118,7 +126,13 @@ def serve(channel: str, eds: Path, stopped: Callable[[], bool]) -> None:
         link.close()
 
 
-if __name__ == "__main__":
+def main(channel: str, eds: Path, interface: str = "hil-local") -> int:
+    """The drive on a bus until SIGTERM."""
     over = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: over.set())
-    serve(sys.argv[1], Path(sys.argv[2]), over.is_set)
+    serve(channel, eds, over.is_set, interface)
+    return 0
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], Path(sys.argv[2]))

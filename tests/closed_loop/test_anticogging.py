@@ -123,9 +123,7 @@ def test_a_commanded_load_takes_it_without_a_currents_lag() -> None:
 
 def test_a_table_of_torques_has_none() -> None:
     torque = 'controller={kind="torque", torque_n_m=[1.0], for_s=[1.0]}'
-    said = (
-        "controller.anticogging: the law torque follows no speed, and gives what it is commanded; leave the key"
-    )
+    said = "controller.anticogging: the law torque follows no speed, and gives what it is commanded; leave"
     with pytest.raises(ControlDesignError, match=said):
         load_setup(PATH, Overrides(settings=(torque, 'reference={kind="step", w_rad_s=0.0}', HARMONIC)))
 

@@ -19,6 +19,7 @@ from hil.bench.processes import share_in_time
 from hil.log.reader import Log, open_log
 from hil.replay import replay_log
 from hil.signals import DriveState, RxFlag
+from tests.amdrive import FRICTION_N_M, LOAD_N_M
 from tests.conftest import CONFIGS
 
 pytestmark = [pytest.mark.vm, pytest.mark.timeout(1800)]
@@ -449,3 +450,28 @@ def test_canplayer_plays_what_was_exported(socketcan: Path) -> None:
     assert [frame[1:] for frame in played] == [frame[1:] for frame in exported]
     lasted, took = (frames[-1][0] - frames[0][0] for frames in (exported, played))
     assert took == pytest.approx(lasted, rel=0.05), "with the timing of the log"
+
+
+def stranger(socketcan: Path, name: str) -> Any:
+    """Ticks in operation of a lockstep run on vcan0 with a drive of strangers, which replays to the bit."""
+    run = seen(socketcan, name)
+    assert run.result["returncode"] == 0 and run.result["run"]["ended"] == "stop_requested", run.result
+    assert replay_log(run.log).verdict == "same"
+    sent = [(frame.can_id, frame.data) for frame in run.log.frames if not frame.received]
+    assert len(sent) > 900 and not Counter(sent) - Counter(run.frames), "what was sent was on the bus"
+    ticks = run.log.ticks
+    return ticks[ticks["state"] == DriveState.OPERATION_ENABLED]
+
+
+def test_a_canopen_node_of_strangers_is_driven_on_vcan(socketcan: Path) -> None:
+    """durand: set up by its own EDS, started, enabled, at speed, left."""
+    on = stranger(socketcan, "stranger_cia402")
+    assert np.abs(on["w"][(on["k"] > 400) & (on["k"] < 550)] - 40.0).max() < 0.5
+
+
+def test_a_joint_of_strangers_is_driven_on_vcan(socketcan: Path) -> None:
+    """am-sdk: its dry friction, then the first of its load step of 4 N m, are what is estimated."""
+    on = stranger(socketcan, "stranger_joint")
+    k, load = on["k"], on["T_L_hat"]
+    for low, high, torque in ((100, 495, FRICTION_N_M), (520, 600, FRICTION_N_M + LOAD_N_M)):
+        assert np.abs(load[(k > low) & (k < high)] - torque).max() < 0.02 * LOAD_N_M

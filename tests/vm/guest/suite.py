@@ -16,7 +16,7 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from hil import cli
@@ -461,6 +461,56 @@ def canplayer() -> None:
     shutil.copytree(folder, OUT / folder.name)
 
 
+def stranger(
+    name: str, config: str, drive: Callable[[], int], settings: Sequence[str], *sets_up: str
+) -> None:
+    """A drive on a stack of strangers on vcan0, in lockstep: it takes longer than a period at times."""
+    folder = SCRATCH / name
+    shutil.copytree("configs", folder / "configs")
+    path = folder / "configs" / "own.toml"
+    path.write_text(config)
+    own = ('bus.interface="socketcan"', 'bus.channel="vcan0"', f'log.folder="{folder}"', *settings)
+    words = [str(path), *(word for one in own for word in ("--set", one))]
+    dump = subprocess.Popen(["candump", "-L", "vcan0"], stdout=(folder / "candump.log").open("w"))
+    there = Forked(folder / "drive.txt", drive)
+    there.until("ready")
+    code = Forked.hil(folder / "configure.txt", "configure", *words, *sets_up).wait() if sets_up else 0
+    run = Forked.hil(folder / "run.json", "run", *words, "--json")
+    code = run.wait() or code
+    there.send_signal(signal.SIGTERM)
+    there.wait()
+    dump.terminate()
+    dump.wait()
+    (folder / "result.json").write_text(
+        json.dumps({"returncode": code, "run": json.loads(run.said() or "{}")})
+    )
+    shutil.copytree(folder, OUT / name)
+
+
+def stranger_cia402() -> None:
+    """durand: set up by SDO from the EDS that it makes itself, NMT, states, speed, stop."""
+    from tests import durand402
+
+    eds = SCRATCH / "durand.eds"
+    short = ("loop.duration_s=0.8", "reference.at_s=0.05", "reference.down_at_s=0.6")
+    short += ("reference.w_rad_s=40.0", "reference.rate_rad_s2=400.0", "reference.jerk_rad_s3=2e4")
+    settings = (*short, 'loop.clock="lockstep"', "canopen.answer_timeout_s=5.0", f'canopen.eds="{eds}"')
+    made = str(SCRATCH / "stranger_cia402" / "configs" / "drives" / "cia402.dbc")
+    config = durand402.config_of(Path("configs/cia402.toml").read_text())
+    stranger(
+        "stranger_cia402", config, lambda: durand402.main("vcan0", eds, "socketcan"), settings, "--dbc", made
+    )
+
+
+def stranger_joint() -> None:
+    """am-sdk: plant and firmware its makers', 64-byte frames."""
+    from tests import amdrive
+
+    (SCRATCH / "am.dbc").write_text(amdrive.DBC)
+    settings = (f'drive.dbc="{SCRATCH / "am.dbc"}"', "loop.duration_s=0.8", "reference.down_at_s=0.6")
+    stranger("stranger_joint", amdrive.CONFIG, lambda: amdrive.main("vcan0", "socketcan"), settings)
+
+
 def instructions() -> None:
     """What a tick costs, phase by phase."""
     counted.measure(OUT)
@@ -500,6 +550,8 @@ def main() -> int:
         queue_is_full,
         no_partner,
         canplayer,
+        stranger_cia402,
+        stranger_joint,
         instructions,
     ]
     wanted = sys.argv[1:]
