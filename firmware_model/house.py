@@ -116,6 +116,7 @@ class HouseFrames(Synchronous):
         self.answers += [(database.message("FEEDBACK", *measured), measured)]
         """What is sent after a SYNC, FEEDBACK last, and the fields of the sample in it."""
         self._check_counters()
+        self._check_floats()
         self._emergency_id = database.message("EMCY").can_id
         self._heartbeat_id = database.message("HEARTBEAT").can_id
         self.sync_id: int | None = database.message("SYNC").can_id
@@ -160,6 +161,16 @@ class HouseFrames(Synchronous):
                     f"{message.name}.Counter begins with {counter.raw_range()[0]} by the DBC; the emulated "
                     "drive counts from 0: give it a DBC of its own in its plant's file"
                 )
+
+    def _check_floats(self) -> None:
+        """The kernels write floats of 32 and 64 bits. Raises DatabaseError."""
+        for message, _ in self.answers:
+            for signal in message.signals.values():
+                if signal.is_float and signal.length == 16:
+                    raise DatabaseError(
+                        f"{message.name}.{signal.name} is a float of 16 bits, which the emulated drive "
+                        "can't send: give it a DBC of its own in its plant's file"
+                    )
 
     @property
     def spoken(self) -> dict[int, int] | None:

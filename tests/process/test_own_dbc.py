@@ -104,3 +104,13 @@ def test_an_emulator_that_counts_otherwise_says_so(configs: Path, settings: Sett
     done = call("emulate", str(configs / "demo.toml"), *flags(settings()))
     assert done.returncode != 0 and "Traceback" not in done.stderr
     assert "COMMAND.Counter begins with 1 by the DBC; the emulated drive counts from 0" in done.stderr
+
+
+def test_an_emulator_that_can_t_send_a_half_float_says_so(configs: Path, settings: Settings) -> None:
+    """A real drive's 16-bit float is read; ours writes floats of 32 and 64 bits alone."""
+    path = configs / "drives/hil_pmsm.dbc"
+    edit(path, "DcLinkVoltage : 16|16@1+ (0.1,0) [0|6553.5]", "DcLinkVoltage : 16|16@1- (1,0) [0|6553.5]")
+    path.write_text(path.read_text() + "SIG_VALTYPE_ 641 DcLinkVoltage : 1;\n")
+    done = call("emulate", str(configs / "demo.toml"), *flags(settings()))
+    assert done.returncode != 0 and "Traceback" not in done.stderr
+    assert "STATUS.DcLinkVoltage is a float of 16 bits, which the emulated drive can't send" in done.stderr
