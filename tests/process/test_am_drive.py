@@ -24,7 +24,7 @@ from tests.canopen import bus_of
 from tests.conftest import ROOT
 from tests.process.test_run import call, flags
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.beside]
 Settings = Callable[..., tuple[str, ...]]
 
 

@@ -30,7 +30,7 @@ from hil.campaign.run import dry_run, one_case
 from hil.errors import HilError
 from tests.conftest import CONFIGS, ROOT
 
-pytestmark = [pytest.mark.process, pytest.mark.compiled]
+pytestmark = [pytest.mark.process, pytest.mark.beside, pytest.mark.compiled]
 CASES = 48
 PLAN = f"""config = "{CONFIGS / "demo.toml"}"
 samples = {CASES}
@@ -195,7 +195,6 @@ def test_a_worker_of_another_version_that_comes_later_runs_nothing() -> None:
         run_batch(None, {**identity(), "numpy": "0"}, 0, 1)  # type: ignore[arg-type]
 
 
-@pytest.mark.beside
 def test_a_fault_script_is_an_axis(tmp_path: Path) -> None:
     """Those cases go over the bus in lockstep; a fault that never comes leaves a simulation's figures."""
     path = tmp_path / "plan.toml"

@@ -58,6 +58,7 @@ def designed(env: dict[str, str]) -> str:
 
 
 @pytest.mark.process
+@pytest.mark.beside
 def test_a_design_has_the_same_bits_under_every_kind_of_blas_and_processor() -> None:
     first, *others = (designed(env) for env in PROCESSORS.values())
     assert first.count("\n") == 4 + len(OBSERVERS) + len(LAWS) + 5 + 1

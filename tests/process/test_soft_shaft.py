@@ -22,7 +22,7 @@ from hil.tuning.verify import off, same_run, verify
 from tests.conftest import CONFIGS
 from tests.unit.test_soft_shaft_keys import soft
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.beside, pytest.mark.slow]
 Settings = Callable[..., tuple[str, ...]]
 DESIGN: dict[str, dict[str, Any]] = {
     "controller": {"kind": "cascade", "speed_pole_rad_s": 186.9, "current_pole_rad_s": 601.5},
