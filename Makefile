@@ -9,7 +9,8 @@ JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py 
     tests/closed_loop/test_current_drive.py
 NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.23.0 \
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
-# Two calls: first what may run beside others, then what has the machine for itself. Together they are all tests.
+# Three calls: what starts no process or needs no clock, the processes in real time, what has the machine for
+# itself. Together they are all tests. The longest of the first is the bench machine's.
 MARKS := (not process or beside) and not alone
 PARALLEL := --numprocesses=auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 COVER := --cov=hil.control --cov=hil.tick.supervisor --cov=hil.tick.guard --cov=hil.tick.kernel --cov=drivers.codec --cov=drivers.e2e
@@ -39,7 +40,8 @@ quick: $(STAMP) lint ## before each commit: lint, types, the fast tests
 
 unit: $(STAMP) ## all tests, compiled
 	$(BIN)/python -m pytest $(PARALLEL) -m "$(MARKS)"
-	$(BIN)/python -m pytest -m "not ($(MARKS))"
+	$(BIN)/python -m pytest $(PARALLEL) -m "process and not beside and not alone"
+	$(BIN)/python -m pytest -m alone
 
 # The same kernels with the compiler off: line and branch coverage can see into them.
 interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage

@@ -28,6 +28,9 @@ RPM_LSB, MILLIAMPERE_LSB, VOLT_LSB = 0.01, 0.1, 0.001
 TOP: Final = (1 << 23) - 1
 KEY: Final = 90
 OFF, ON, FAULTED = 0, 1, 9
+IN_FAULT: Final = int(State.FAULT)
+STEPS: Final = {int(State.SWITCH_ON_DISABLED): 0x06, int(State.READY_TO_SWITCH_ON): 0x07}
+"""Controlwords on the way to operation; 0x0F from there on."""
 
 
 def int24(value: float) -> bytes:
@@ -114,13 +117,10 @@ def mode(state: int) -> int:
 
 def controlword(state: Any, on: bool, clear: bool) -> int:
     """The step of the state machine inside that the enable bit leads to; one step a cycle."""
-    if state["state"] == State.FAULT:
+    inside = int(state["state"])
+    if inside == IN_FAULT:
         return 0x80 if clear else 0x00
-    if not on:
-        return 0x00
-    return {int(State.SWITCH_ON_DISABLED): 0x06, int(State.READY_TO_SWITCH_ON): 0x07}.get(
-        int(state["state"]), 0x0F
-    )
+    return STEPS.get(inside, 0x0F) if on else 0x00
 
 
 MEMBER: Final = Dialect(

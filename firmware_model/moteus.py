@@ -60,6 +60,12 @@ _SCALES: Final = {
 }  # fmt: skip
 """Of one step as int8, int16 and int32; of other registers 1."""
 TURN: Final = 2.0 * math.pi
+IN_FAULT, ENABLED, TIMED_OUT = (
+    int(State.FAULT),
+    int(State.OPERATION_ENABLED),
+    int(ErrorCode.COMMUNICATION_TIMEOUT),
+)
+"""As numbers: to look up an enumeration's member takes longer than what is done with it."""
 
 
 class Subframe(NamedTuple):
@@ -167,6 +173,7 @@ class MoteusFrames(Synchronous):
         self._turns, self._turned_ns = 0.0, 0
         self._default_ns: int | None = None
         self._drive: Kernels | None = None
+        self._known: dict[int, Callable[[], float]] | None = None
         self.sync_id: int | None = EFF_FLAG | ASKS | node_id
         """The command of the first master: it moves a drive in lockstep on."""
         self.ignored: Counter[str] = Counter()
@@ -216,10 +223,10 @@ class MoteusFrames(Synchronous):
             fits = False
         self._watch(mode, said.get(WATCHDOG, 0.0), drive)
         self._on, self._clear = fits, self._clear or mode == STOPPED
-        if drive.state["state"] == State.FAULT:
+        if drive.state["state"] == IN_FAULT:
             self._on = False
         word = controlword(drive.state, self._on, self._clear)
-        self._clear = self._clear and drive.state["state"] != State.FAULT
+        self._clear = self._clear and drive.state["state"] != IN_FAULT
         self._counter = (self._counter + 1) % self.counter_modulus
         drive.command(self._counter, word, q if fits else 0.0, d if fits else 0.0)
 
@@ -268,8 +275,15 @@ class MoteusFrames(Synchronous):
 
     def register(self, number: int, drive: Kernels) -> float | None:
         """What a register holds now; None for one that is not modelled."""
+        if self._known is None:
+            self._known = self._registers(drive)
+        held = self._known.get(number)
+        return None if held is None else float(held())
+
+    def _registers(self, drive: Kernels) -> dict[int, Callable[[], float]]:
+        """What the registers hold, by their numbers."""
         sample = drive.sample
-        known: dict[int, Callable[[], float]] = {
+        return {
             MODE: lambda: self._mode(drive.state),
             0x001: lambda: self._turns,
             VELOCITY_AT: lambda: sample["w"] / TURN,
@@ -283,19 +297,18 @@ class MoteusFrames(Synchronous):
             0x00E: lambda: sample["temperature_inverter"] or drive.params["ambient"],
             FAULT_AT: lambda: self._fault(drive.state),
         }
-        return float(known[number]()) if number in known else None
 
     def _mode(self, state: Any) -> int:
-        if state["state"] == State.FAULT:
-            return TIMEOUT if state["error"] == ErrorCode.COMMUNICATION_TIMEOUT else FAULT
-        if state["state"] != State.OPERATION_ENABLED:
+        if state["state"] == IN_FAULT:
+            return TIMEOUT if state["error"] == TIMED_OUT else FAULT
+        if state["state"] != ENABLED:
             return STOPPED
         assert self._drive is not None  # noqa: S101 - it was enabled by a command
         return next(mode for mode, takes in MODES.items() if takes == self._drive.params["takes"])
 
     @staticmethod
     def _fault(state: Any) -> int:
-        return ERRORS.get(int(state["error"]), DRIVER_FAULT) if state["state"] == State.FAULT else 0
+        return ERRORS.get(int(state["error"]), DRIVER_FAULT) if state["state"] == IN_FAULT else 0
 
 
 MEMBER: Final = Dialect(

@@ -38,23 +38,21 @@ FRESH, COUNTER_JUMP = int(RxFlag.FRESH), int(RxFlag.COUNTER_JUMP)
 
 
 class Fields:
-    """The integer fields of the first record, by their names: read and set in a fifth of numpy's time."""
+    """The integer fields of the first record, by their names: read and set in a fifth of numpy's time.
+
+    All are looked up when it is made: the first ticks of a run would have no time for it.
+    """
 
     def __init__(self, ticks: TickArray) -> None:
-        self._ticks, self._cells = ticks, dict[str, Any]()
+        names = [name for name in ticks.dtype.names or () if ticks.dtype[name].kind in "iu"]
+        self._cells: dict[str, Any] = {name: cell(ticks, name) for name in names if name[0] != "_"}
 
     def __getitem__(self, name: str) -> int:
-        value: int = self._cell(name)[0]
+        value: int = self._cells[name][0]
         return value
 
     def __setitem__(self, name: str, value: int) -> None:
-        self._cell(name)[0] = value
-
-    def _cell(self, name: str) -> Any:
-        found = self._cells.get(name)
-        if found is None:
-            found = self._cells[name] = cell(self._ticks, name)
-        return found
+        self._cells[name][0] = value
 
 
 def new_pace() -> Pace:

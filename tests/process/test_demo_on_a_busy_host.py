@@ -15,7 +15,7 @@ import pytest
 from hil.log.reader import open_log
 from tests.process.test_run import flags, wait_for_log
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.alone]
 Settings = Callable[..., tuple[str, ...]]
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tests.conftest import ROOT
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.slow]
 
 
 def test_every_kill_leaves_a_drive_at_rest_and_a_log() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.soak.run import Track, findings, process_findings, show
 
-pytestmark = [pytest.mark.process, pytest.mark.slow]
+pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.slow]
 
 
 def test_twenty_seconds_lose_nothing_and_grow_nothing(
