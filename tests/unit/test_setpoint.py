@@ -14,6 +14,7 @@ from hil.config.setpoint_design import acceleration_max, setpoint_params, stop_r
 from hil.control.errors import ControlDesignError
 from hil.control.law import FAC
 from hil.control.references import reference_at
+from hil.control.speed import FOLLOWS, LEADS
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Request, new_ticks
 from hil.sim.simulate import simulate_ticks
@@ -286,3 +287,12 @@ def test_parameters_are_of_the_config_alone() -> None:
     assert setpoint_params(setup.config).tobytes() == setup.machine.setpoint.tobytes()
     assert replace(setup.machine).at_once().setpoint["stop_ticks"] == 0
     assert setup.machine.setpoint["stop_ticks"] == 5000
+
+
+@pytest.mark.parametrize(("pair", "i_q"), [(0, 0.0), (LEADS, 2.5), (FOLLOWS, 7.0)])
+def test_the_current_that_is_asked_for_goes_by_the_part_in_a_pair(pair: int, i_q: float) -> None:
+    """The profile's of the law that commands both nodes; what the other has written of the one that follows."""
+    bench = Bench()
+    bench.machine.reference["i_q"], bench.machine.law["pair"], bench.t["i_q_ref_in"] = 2.5, pair, 7.0
+    bench.tick(Request.ARM, 80.0)
+    assert bench.t["i_q_ref_in"] == i_q
