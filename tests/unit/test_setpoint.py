@@ -291,7 +291,7 @@ def test_parameters_are_of_the_config_alone() -> None:
 
 @pytest.mark.parametrize(("pair", "i_q"), [(0, 0.0), (LEADS, 2.5), (FOLLOWS, 7.0)])
 def test_the_current_that_is_asked_for_goes_by_the_part_in_a_pair(pair: int, i_q: float) -> None:
-    """The profile's of the law that commands both nodes; what the other has written of the one that follows."""
+    """The profile's where the law commands both nodes; what the other has written where it follows."""
     bench = Bench()
     bench.machine.reference["i_q"], bench.machine.law["pair"], bench.t["i_q_ref_in"] = 2.5, pair, 7.0
     bench.tick(Request.ARM, 80.0)
