@@ -23,13 +23,13 @@ MOST_MS: Final = 2.5
 def shaft_rows(setup: Setup) -> list[Row]:
     """Whether the emulated plant has the shaft of ``motor.shaft``; of voltage drives the margins on it."""
     told = elastic_shaft(setup.config.motor)
+    emulated = setup.config.emulator is not None and is_emulated_bus(setup.config)
     try:
-        real = real_shaft(setup)
+        real = real_shaft(setup) if emulated else None
     except ConfigError as error:
         return [] if told is None else [Row(ROW, "warn", str(error), "correct emulator.plant")]
     if told is None and real is None:
         return []
-    emulated = setup.config.emulator is not None and is_emulated_bus(setup.config)
     if told is None:
         remedy = "write it into motor.shaft, or design for it: hil design"
         return [Row(ROW, "warn", f"the emulated plant has {_words(real)}, the observer knows none", remedy)]
@@ -42,9 +42,7 @@ def shaft_rows(setup: Setup) -> list[Row]:
 
 
 def real_shaft(setup: Setup) -> Shaft | None:
-    """The coupling in the emulated plant's file. Raises ConfigError."""
-    if setup.config.emulator is None or not is_emulated_bus(setup.config):
-        return None
+    """The coupling in the plant's file. Raises ConfigError."""
     plant, _ = load_plant(setup.path, setup.config)
     if plant.coupling is None:
         return None

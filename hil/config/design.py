@@ -222,11 +222,7 @@ def known_cogging(config: RunConfig) -> Harmonics | None:
     if given is None:
         return None
     motor, where = config.motor, "controller.anticogging"
-    if not config.follows_speed:
-        raise ControlDesignError(
-            f"{where}: the law {config.controller.kind} follows no speed, and gives what it is "
-            "commanded; leave the key out"
-        )
+    _follows_speed(config, where)
     named = given.motor and motor.name and given.motor != motor.name
     if named or given.n_p != motor.n_p or abs(given.k_t_n_m_a / config.k_t - 1.0) > OTHER_MOTOR:
         raise ControlDesignError(
@@ -243,6 +239,15 @@ def known_cogging(config: RunConfig) -> Harmonics | None:
     known: Harmonics = given.known
     _each_tick(config, where)
     return known
+
+
+def _follows_speed(config: RunConfig, where: str) -> None:
+    """Refuse a load that is known beforehand where the law gives the torque that it is commanded."""
+    if not config.follows_speed:
+        raise ControlDesignError(
+            f"{where}: the law {config.controller.kind} follows no speed, and gives what it is "
+            "commanded; leave the key out"
+        )
 
 
 def _each_tick(config: RunConfig, where: str) -> None:
@@ -270,10 +275,7 @@ def known_weight(config: RunConfig) -> Harmonics | None:
     given, where = config.controller.known_load, "controller.known_load"
     if given is None:
         return None
-    if config.controller.kind == "torque":
-        raise ControlDesignError(
-            f"{where}: the law torque follows no speed and gives what its table says; leave the key out"
-        )
+    _follows_speed(config, where)
     most = min(config.k_t * config.limits.i_max_a, config.limits.torque_max_n_m or math.inf)
     w = config.limits.w_max_rad_s
     for key, peak, at in (
