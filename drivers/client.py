@@ -54,8 +54,8 @@ from drivers.posix import (
     SYNC_COUNTS,
     UNSENT,
     command,
+    drain,
     exchange,
-    follow,
     rest,
 )
 from drivers.rawlink import raw_link
@@ -269,7 +269,7 @@ class DriveClient:
         if self._port is None or self._command is None or self.binding.map.state == "":
             return None
         places, size = self._port.places, 0 if self._sync is None else len(self._sync.view)
-        return Compiled(places.get(exchange), places[follow], places[command], size, self._log)
+        return Compiled(places.get(exchange), places[drain], places[command], size, self._log)
 
     @property
     def timed(self) -> KernelSync | None:

@@ -16,13 +16,11 @@ from drivers.posix import (
     DRAIN_MOST,
     FLAGS,
     FLAGS_AT,
-    HEARD,
     MORE,
     STATE_AT,
     command,
     drain,
     exchange,
-    follow,
 )
 from drivers.wire import STATE
 
@@ -55,7 +53,7 @@ class SocketPort:
     """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
 
     def __init__(self, link: SocketLink, shared: Arrays) -> None:
-        io = np.zeros(HEARD + 1, np.int64)
+        io = np.zeros(STATE_AT + 1, np.int64)
         self.io: Any = io.data
         self.places: dict[Any, npt.NDArray[np.int64]] = {}
         """What each kernel is called with."""
@@ -76,7 +74,6 @@ class SocketPort:
         """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; offsets in the tick."""
         self.io[FLAGS], self.io[MORE], self.io[FLAGS_AT], self.io[STATE_AT] = 0, 0, flags_at, state_at
         made = self._over(drain, own, free=(0, False))
-        self.places[follow] = self.places[drain]
         self.restart()
         return made
 

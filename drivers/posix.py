@@ -56,16 +56,11 @@ DONE, HANDED_BACK, PENDING = range(3)
 """What a kernel returns: it is done; the caller has a frame to judge or the log is full; frames wait."""
 REFUSED_COMMAND: Final = -1000
 """A value of the command fits no signal: this and less by the message's place; others are -errno."""
-WAITS, LEFT = -1, -2
-"""What :func:`follow` returns when it did nothing, or not all."""
-NO_WAIT_NS: Final = 1
-"""A deadline that has long passed: one feedback if it is there already."""
 UNSENT: Final = -2000
 """What -errno of a SYNC that was not sent is added to."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE, STATE_AT, HEARD = range(10)
-"""Of ``io``. STATE_AT: offset of the tick's drive_state; HEARD: feedback that :func:`follow` took before
-what it left to its caller."""
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE, STATE_AT = range(9)
+"""Of ``io``. STATE_AT: offset of the tick's drive_state."""
 EAR_FD, PERIOD, SYNCED, STAMP, MESSAGE_AT = range(5)
 IOV_AT, CONTROL_AT, FRAME_AT, EAR_WORDS = 11, 13, 21, 30
 """Words of an ear: its descriptor, the period, how many SYNCs were heard since the last look, when the newest
@@ -264,34 +259,6 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     code = transmit(fds, raw, size, state, log)
     rest(raw)
     return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
-
-
-@waiting
-def follow(places: Any, deadline_ns: int, most: int) -> Any:
-    """Wait for feedback until the deadline, then take what else is there; of several the newest counts.
-
-    Returns how many came, FRESH then in the tick's flags; WAITS where flags wait to be told or the bus was
-    down; LEFT where the caller must go on: what :func:`drain` returned is in ``IO`` at EXCHANGED, and how
-    many came before at HEARD.
-    """
-    s, io = array_at(places, STATES, STATE)[0], array_at(places, IO, I8)
-    if s["pending"] != 0 or s["down"] != 0:
-        return WAITS
-    at, tick = io[FLAGS_AT], array_at(places, TICK, U1)
-    flags = tick[at : at + 4].view(np.uint32)
-    heard, until_ns = 0, deadline_ns
-    while heard < most:
-        code = drain(places, until_ns, False)
-        if code != DONE:
-            io[EXCHANGED], io[HEARD] = code, heard
-            return LEFT
-        if flags[0] & np.uint32(FRESH) == 0:
-            break
-        heard, until_ns = heard + 1, NO_WAIT_NS
-        flags[0] &= np.uint32(0xFFFFFFFF - FRESH)
-    if heard > 0:
-        flags[0] |= np.uint32(FRESH)
-    return heard
 
 
 @jit

@@ -31,20 +31,17 @@ from drivers.posix import (
     EINTR,
     EXCHANGED,
     IO,
-    LEFT,
     MONOTONIC,
     PENDING,
     STAMP,
     STATES,
     SYNCED,
-    WAITS,
     clock_ns,
     command,
+    drain,
     exchange,
-    follow,
     now_ns,
 )
-from drivers.posix import HEARD as TAKEN
 from drivers.wire import STATE
 from hil.config.design import Machine
 from hil.log.push import HEADER, NOWHERE, push
@@ -58,12 +55,10 @@ from hil.runtime.rules import (
     COUNTER_JUMP,
     DECIDED,
     DID,
-    HEARD,
     LOST,
     NEVER,
     NEXT,
     NOT_BEGUN,
-    QUEUE_MOST,
     RAN,
     RECORDED,
     SENT,
@@ -75,6 +70,7 @@ from hil.runtime.rules import (
     count,
     is_due,
     is_news,
+    newest,
     stamp,
     wake,
 )
@@ -326,6 +322,22 @@ def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
 
 
 @jit
+def receive(table: Any, t: Any, deadline_ns: int) -> Any:
+    """For :func:`newest`. What the client must tell first is the loop's, as is a guardian that has fired."""
+    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
+    s = array_at(places, STATES, STATE)[0]
+    if s["pending"] != 0 or s["down"] != 0 or (len(words) > 0 and words[FIRED] != 0):
+        return False
+    code = drain(places, deadline_ns, False)
+    if code != DONE:
+        array_at(places, IO, I8)[EXCHANGED] = code
+        return False
+    if len(words) > 0:
+        t["rx_flags"] |= guardian_flags(words)
+    return True
+
+
+@jit
 def heard(table: Any, t: Any, came: int) -> None:
     """Stamp a tick that feedback, or SYNC of the kernel's, woke."""
     times, pace, plan = array_at(table, TIMES_AT, I8), array_at(table, PACE, I8), array_at(table, PLAN, I8)
@@ -343,8 +355,7 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     """:func:`run_tick` for a tick that begins when the drive's cyclic feedback comes."""
     times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
     mark(marks, LOOP, times)
-    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
-    if k == 0 or (len(words) > 0 and words[FIRED] != 0):
+    if k == 0:
         return NOT_BEGUN
     pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
     t = ticks[0]
@@ -352,15 +363,10 @@ def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: b
     stamp(t, k, deadline_ns, 1, 0)
     begin(t, asked, log_failed)
     wait = plan[WAIT_NS if is_due(pace, plan[EVERY]) else PERIOD_NS]
-    came = follow(places, pace[ARRIVED] + wait, QUEUE_MOST)
+    came = newest(receive, table, t, pace, pace[ARRIVED] + wait)
     mark(marks, READ, times)
-    if came == WAITS:
-        return NOT_BEGUN
-    if came == LEFT:
-        pace[HEARD] = array_at(places, IO, I8)[TAKEN]
+    if came < 0:
         return BEGUN
-    if len(words) > 0:
-        t["rx_flags"] |= guardian_flags(words)
     heard(table, t, came)
     return conclude(table, ticks, int(t["t_ns"]), request)
 

@@ -20,14 +20,11 @@ from hil.runtime.rules import (
     COUNTER_JUMP,
     DECIDED,
     FRESH,
-    HEARD,
     LOST,
     MAX_NS,
     NEVER,
     NEXT,
-    NO_WAIT,
     NOT_BEGUN,
-    QUEUE_MOST,
     RAN,
     RECORDED,
     STEER_EVERY,
@@ -41,6 +38,7 @@ from hil.runtime.rules import (
     is_due,
     is_news,
     new_pace,
+    newest,
     stamp,
     wake,
 )
@@ -312,7 +310,7 @@ class Loop:
         elif timer:
             self._drive.receive(tick, 0)
         else:
-            self._newest_feedback(tick)
+            self._newest_feedback()
         t["received_ns"] = bounded(now() - t["t_ns"])
         if timer:
             self._note_age()
@@ -338,25 +336,23 @@ class Loop:
         course.conclude()
         self._ended = course.ended
 
-    def _newest_feedback(self, tick: Any) -> None:
+    def _receive(self, _t: Fields, deadline_ns: int) -> bool:
+        """All that comes until then, or until feedback."""
+        self._drive.receive(self._tick, deadline_ns)
+        return True
+
+    def _newest_feedback(self) -> None:
         """Wait for cyclic feedback; of several that queued up the newest counts: :func:`wake`.
 
         Where the kernel sends SYNC, each SYNC is one period, and its stamp is when it came.
         """
-        t, pace, plan, drive = self._t, self._pace, self._plan, self._drive
+        t, pace, plan = self._t, self._pace, self._plan
         if not t["k"]:
             pace[ARRIVED] = self._clock.now_ns()
-        heard, pace[HEARD] = pace[HEARD], 0
         wait = wait_ns(plan, self._timed is not None) if is_due(pace, plan.every) else plan.period_ns
         until_ns = self._clock.receive_deadline(pace[ARRIVED], wait)
-        drive.receive(tick, NO_WAIT if heard else until_ns)
-        while t["rx_flags"] & FRESH and heard < QUEUE_MOST:
-            heard += 1
-            t["rx_flags"] &= ~FRESH
-            drive.receive(tick, NO_WAIT)
+        heard = newest(Loop._receive, self, t, pace, until_ns)
         now_ns, jumped = self._clock.now_ns(), t["rx_flags"] & COUNTER_JUMP
-        if heard:
-            t["rx_flags"] |= FRESH
         if self._timed is not None:
             heard, stamp_ns = self._timed.taken()
             now_ns, jumped = stamp_ns if heard else now_ns, 0

@@ -17,8 +17,8 @@ from hil.signals import ALL_MISSING, Request, RxFlag, TickArray, cell
 
 Pacing = Literal["sync", "feedback", "timer"]
 Pace = npt.NDArray[np.int64]
-"""ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many a compiled tick has taken
-of a queue that it left to the loop; SINCE: periods from the last tick with feedback to the one before. Of the
+"""ARRIVED: when the newest cyclic feedback came, or was due [ns]; HEARD: how many were taken of a queue whose
+rest is left to the loop; SINCE: periods from the last tick with feedback to the one before. Of the
 last compiled call: RAN: ticks that it recorded; LOST: periods that it skipped; NEXT: number of the tick to go
 on with; DID: of several nodes' exchange or commands, how many steps are done."""
 ARRIVED, HEARD, SINCE, RAN, LOST, NEXT, DID = range(7)
@@ -95,6 +95,26 @@ def is_due(pace: Any, every: int) -> bool:
 def count(pace: Any, t: Any) -> None:
     """Count a tick that is over, for :func:`is_due` of the next."""
     pace[SINCE] = 0 if t["rx_flags"] & FRESH else pace[SINCE] + t["gap"]
+
+
+@register_jitable
+def newest(receive: Any, x: Any, t: Any, pace: Any, until_ns: int) -> int:
+    """Wait for feedback, then take what else is there: the newest counts. How many came; -1: some are left.
+
+    ``receive(x, t, deadline)`` takes one; False when what it has begun is left to the loop, which goes on.
+    """
+    heard, pace[HEARD] = int(pace[HEARD]), 0
+    while heard < QUEUE_MOST:
+        if not receive(x, t, NO_WAIT if heard else until_ns):
+            pace[HEARD] = heard
+            return -1
+        if not t["rx_flags"] & FRESH:
+            break
+        heard += 1
+        t["rx_flags"] &= ~FRESH
+    if heard:
+        t["rx_flags"] |= FRESH
+    return heard
 
 
 @register_jitable

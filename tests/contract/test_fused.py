@@ -650,8 +650,8 @@ FOLLOWED: dict[str, tuple[Act, set[int], str]] = {
     "strangers' frames": (strangers, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
     "second master": (second_master, {SENT, NOT_BEGUN, BEGUN}, "FOREIGN_COMMAND"),
     "wrong length": (wrong_length, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "the other end is gone": (gone, {SENT, NOT_BEGUN, DECIDED}, "SEND_FAILED"),
-    "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+    "the other end is gone": (gone, {SENT, NOT_BEGUN, BEGUN, DECIDED}, "SEND_FAILED"),
+    "the guardian fires": (fired, {SENT, NOT_BEGUN, BEGUN}, "GUARDIAN"),
 }
 
 
@@ -675,7 +675,7 @@ BY_THE_KERNEL: dict[str, tuple[Act, set[int], str]] = {
     "late feedback": (answered_late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
     "another's SYNC": (sync_of_another, {SENT, NOT_BEGUN}, "FOREIGN_COMMAND"),
     "emergency": (timed(alarm), {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
-    "the guardian fires": (timed(fired), {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+    "the guardian fires": (timed(fired), {SENT, NOT_BEGUN, BEGUN}, "GUARDIAN"),
 }
 TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
     "by us": CASES,
