@@ -128,6 +128,7 @@ class _Binder:
             self._add(mistake)
         for mistake in mistakes_of_states(self._map, state) if state else ():
             self._add(mistake)
+        self._check_cycles({b.message.name for b in incoming}, (sync, emergency, heartbeat))
         self._check_periods(incoming)
         self._check_echo()
         for mistake in mistakes_of_values(made):
@@ -153,10 +154,15 @@ class _Binder:
         if not name:
             return None
         try:
-            return self._database.message(name, *signals)
+            return self._cycled(self._database.message(name, *signals))
         except DatabaseError as error:
             self._add(f"{part}: {str(error).removeprefix(f'{self._database.path}: ')}")
             return None
+
+    def _cycled(self, message: Message) -> Message:
+        """The message as often as the drive is said to send it."""
+        cycle_ms = self._map.cycle_ms.get(message.name)
+        return message if cycle_ms is None else message.sent_every(cycle_ms)
 
     def _by_message(self, places: dict[str, tuple[str, str]]) -> dict[str, dict[str, str]]:
         """Signal by part of each message that the places name and that has them all."""
@@ -232,7 +238,7 @@ class _Binder:
 
     def _converted(self, name: str, signals: dict[str, str], parts: dict[str, Part]) -> tuple[Message, str]:
         """A message with its parts in SI units and its counter from 0 on, and the counter's name."""
-        message = self._database.message(name)
+        message = self._cycled(self._database.message(name))
         converted = {
             signal: self._checked(part, parts[part], message.signals[signal], f"{name}.{signal}")
             for part, signal in signals.items()
@@ -352,6 +358,14 @@ class _Binder:
             )
         return name
 
+    def _check_cycles(self, received: set[str], others: tuple[Message | None, ...]) -> None:
+        """A cycle time must be of a message that is heard."""
+        known = received | {message.name for message in others if message is not None}
+        for name in sorted(self._map.cycle_ms.keys() - known):
+            self._add(
+                f"cycle_ms: {name} is no message that is received; take one of {', '.join(sorted(known))}"
+            )
+
     def _check_periods(self, incoming: list[Bound]) -> None:
         """Measurements must come as often as is said, by the DBC's cycle time where it has one."""
         for bound in incoming:
@@ -360,7 +374,9 @@ class _Binder:
             if measures and self._period_ms is not None and cycle > self._period_ms:
                 self._add(
                     f"{bound.message.name} comes every {cycle:g} ms by the DBC, the loop counts on one every "
-                    f"{self._period_ms:g} ms; write feedback.period_ms = {cycle:g}, or lower loop.rate_hz"
+                    f"{self._period_ms:g} ms; write feedback.period_ms = {cycle:g}, lower loop.rate_hz, or, "
+                    "where the drive is set to more, drive.signals.cycle_ms = "
+                    f"{{ {bound.message.name} = {self._period_ms:g} }}"
                 )
 
     def _check_shared(self, message: Message, names: Iterable[str]) -> None:

@@ -66,6 +66,12 @@ class Message:
         other.signals = {**self.signals, **signals}
         return other
 
+    def sent_every(self, cycle_ms: float) -> Message:
+        """The same message with another cycle time than the DBC's."""
+        other = copy.copy(self)
+        other.cycle_ms = cycle_ms
+        return other
+
     @property
     def send_id(self) -> int:
         """The identifier as it stands in a frame: extended ones carry SocketCAN's flag."""

@@ -7,6 +7,7 @@ nowhere else. Binding a map to a DBC checks it whole, and names all mistakes at 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -167,6 +168,8 @@ class DriveMap:
     """CANopen's NMT message: the drive's node is started after arming, and every stop leaves operation."""
     counters: tuple[str, ...] = ()
     """Frame counters, one for each message that has one."""
+    cycle_ms: Mapping[str, float] = field(default_factory=dict)
+    """How often the drive sends a message, where it is set to another rate than the DBC says."""
     constants: Mapping[str, int | float] = field(default_factory=dict)
     """Signals that are always sent with a value, by MESSAGE.Signal."""
     expect: Mapping[str, int] = field(default_factory=dict)
@@ -276,6 +279,9 @@ def _value(key: str, value: Any) -> Any:
         return _named(value, int | float)
     if key == "expect":
         return _named(value, int)
+    if key == "cycle_ms":
+        cycles = _named(value, int | float)
+        return cycles if cycles and all(0.0 < one < math.inf for one in cycles.values()) else None
     if key == "unwatched":
         return value if isinstance(value, bool) else None
     if key == "units":

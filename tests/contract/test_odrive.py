@@ -202,6 +202,15 @@ def test_what_the_emulated_drive_sends_is_read_by_cantools() -> None:
         ('drive.signals.on_change=["Set_Input_Torque"]', "carries the command, which each tick sends"),
         ('drive.signals.on_change=["Get_Iq"]', "on_change: Get_Iq is no message of the command"),
         ('drive.signals.start=[{message="Nothing"}]', "start: "),
+        (
+            "drive.signals.cycle_ms={Set_Axis_State=1}",
+            "cycle_ms: Set_Axis_State is no message that is received",
+        ),
+        ("drive.signals.cycle_ms={Get_Iq=0}", "cycle_ms: {'Get_Iq': 0} is not of the form"),
+        (
+            "drive.signals.cycle_ms={Get_Iq=10}",
+            "or, where the drive is set to more, drive.signals.cycle_ms = { Get_Iq",
+        ),
         ('drive.signals.start=[{message="Clear_Errors",values={Foo=1}}]', "Foo"),
         ('drive.signals.start=[{message="Clear_Errors",expect={Heartbeat=0}}]', "MESSAGE.Signal"),
         ('drive.signals.start=[{massage="Clear_Errors"}]', "is not of the form that it takes"),
