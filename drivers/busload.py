@@ -65,6 +65,11 @@ def message_rates(binding: Binding, rate_hz: float, every: int = 1) -> list[tupl
     return rates + ([(beat, 1000.0 / beat.cycle_ms)] if beat and beat.cycle_ms else [])
 
 
+def emulated_alone(binding: Binding) -> set[str]:
+    """Messages that carry nothing but what only an emulated drive knows."""
+    return {b.message.name for b in binding.incoming if {part for part, _ in b.parts} == {"load_true"}}
+
+
 def message_shares(
     rates: Iterable[tuple[Message, float]], bitrate: int, data_bitrate: int | None = None
 ) -> dict[str, float]:

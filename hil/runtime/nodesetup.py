@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from drivers.busload import message_rates, message_shares
+from drivers.busload import emulated_alone, message_rates, message_shares
 from drivers.hub import heard_ids
 from hil.config.design import inner_loop
 from hil.config.nodefile import load_nodes
 from hil.errors import ArmingError, ConfigError
 from hil.runtime.bus import is_emulated_bus
-from hil.runtime.refusals import LOAD_REMEDY, MAX_LOAD
+from hil.runtime.refusals import LOAD_REMEDY, load_words
 from hil.runtime.setup import Overrides, Setup, setup_of
 
 Nodes = Mapping[str, Setup]
@@ -121,16 +121,15 @@ def _pair(setups: Nodes) -> list[str]:
 def nodes_load(setups: Nodes) -> tuple[str, bool]:
     """Worst-case bus load of all nodes in words, SYNC once, and whether it is allowed."""
     shares: dict[str, float] = {}
+    emulated: set[str] = set()
     for index, (name, setup) in enumerate(setups.items()):
         bus, sync = setup.config.bus, setup.binding.sync
         rates = message_rates(setup.binding, float(setup.config.loop.rate_hz))
         rates = [(message, rate) for message, rate in rates if not (index and message is sync)]
         own = message_shares(rates, bus.bitrate, bus.data_bitrate)
         shares |= {f"{name} {message}": share for message, share in own.items()}
-    load = sum(shares.values())
-    frames = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
-    words = f"{100 * load:.0f} % at {bus.bitrate} bit/s with every stuff bit, without other nodes: {frames}"
-    return words, load <= MAX_LOAD
+        emulated |= {f"{name} {message}" for message in emulated_alone(setup.binding)}
+    return load_words(shares, emulated, bus.bitrate)
 
 
 def check_nodes_load(setups: Nodes) -> None:

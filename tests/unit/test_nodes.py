@@ -32,6 +32,7 @@ from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
 from hil.runtime.nodes import Together
 from hil.runtime.nodesetup import load_node_setups, nodes_load
+from hil.runtime.refusals import load_found
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, RxFlag, new_ticks
 from hil.sim.emulate import make_bench
@@ -188,11 +189,19 @@ def test_an_entry_without_a_name(tmp_path: Path) -> None:
 
 
 def test_the_bus_load_counts_sync_once() -> None:
-    """docs/drives/cia402.md: two drives take 52.5 % at 1 kHz; an emulator's TPDO2 and heartbeats on top."""
+    """docs/drives/cia402.md: two drives take 51.6 % at 1 kHz; what an emulator adds is told beside it."""
     found, good = nodes_load(setups_of())
     assert found.count("SYNC") == 1 and found.count("TPDO1") == found.count("RPDO1") == 2
-    assert found.startswith("71 % at 1000000 bit/s") and not good
-    assert nodes_load(setups_of("loop.rate_hz=500"))[1]
+    assert found.startswith("52 % at 1000000 bit/s") and good
+    assert found.endswith("; 19 % more by load TPDO2, motor TPDO2, which no real drive sends")
+    slow, good = nodes_load(setups_of("bus.bitrate=500000"))
+    assert slow.startswith("103 % at 500000 bit/s") and not good
+    assert (
+        "more by"
+        not in load_found(
+            load_setup(CONFIGS / "odrive.toml", Overrides(settings=('drive.signals.load_true=""',)))
+        )[0]
+    )
 
 
 def test_a_torque_by_its_table() -> None:
