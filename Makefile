@@ -4,14 +4,16 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 export NUMBA_CACHE_DIR ?= $(CURDIR)/.cache/numba
+unexport PYTHONDONTWRITEBYTECODE  # some hundred programs are started: none compiles all modules anew
 JITTED := $(wildcard tests/unit/test_control_*.py tests/contract/test_codec*.py tests/unit/test_drivers*.py) \
     $(wildcard tests/unit/test_guard*.py tests/unit/test_supervisor*.py) tests/unit/test_protocol.py tests/unit/test_cogging.py tests/property \
     tests/closed_loop/test_current_drive.py
 NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.23.0 \
     @foxglove/studio-base@1.48.0 react@17.0.2 react-dom@17.0.2
 # Three calls: what starts no process or needs no clock, the processes in real time, what has the machine for
-# itself. Together they are all tests. The longest of the first is the bench machine's.
+# itself. With LONG=1 they are all tests, and the longest of the first is the bench machine's.
 MARKS := (not process or beside) and not alone
+LESS := $(if $(LONG),, and not long)
 PARALLEL := --numprocesses=auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 COVER := --cov=hil.control --cov=hil.tick.supervisor --cov=hil.tick.guard --cov=hil.tick.kernel --cov=drivers.codec --cov=drivers.e2e
 
@@ -28,7 +30,7 @@ $(STAMP): pyproject.toml constraints.txt
 demo: $(STAMP) ## close the loop against the emulated drive, step the load, replay the log
 	$(BIN)/hil demo
 
-test: $(STAMP) lint unit interpreted ## everything that must be green
+test: $(STAMP) lint unit $(if $(LONG),interpreted) ## what must be green before a push; LONG=1: all that must be green
 
 lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff check
@@ -38,10 +40,10 @@ lint: $(STAMP) ## ruff and mypy
 quick: $(STAMP) lint ## before each commit: lint, types, the fast tests
 	$(BIN)/python -m pytest -q $(PARALLEL) -m "$(MARKS) and not process and not slow" tests/unit tests/property tests/closed_loop
 
-unit: $(STAMP) ## all tests, compiled
-	$(BIN)/python -m pytest $(PARALLEL) -m "$(MARKS)"
-	$(BIN)/python -m pytest $(PARALLEL) -m "process and not beside and not alone"
-	$(BIN)/python -m pytest -m alone
+unit: $(STAMP) ## the tests, compiled (LONG=1: all)
+	$(BIN)/python -m pytest $(PARALLEL) -m "$(MARKS)$(LESS)"
+	$(BIN)/python -m pytest $(PARALLEL) -m "process and not beside and not alone$(LESS)"
+	$(BIN)/python -m pytest -m "alone$(LESS)"
 
 # The same kernels with the compiler off: line and branch coverage can see into them.
 interpreted: $(STAMP) ## the kernels' tests with the compiler off, with coverage

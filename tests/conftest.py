@@ -32,9 +32,13 @@ MACHINE = "tests/vm/"
 """Its tests share one boot of the bench machine: one worker's, and the longest job of all."""
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest job first, so that the other workers have something to do meanwhile."""
+    """Which cases are long; the longest job first, so that other workers have something to do meanwhile."""
     items.sort(key=lambda item: not item.nodeid.startswith(MACHINE))
+    for item in items:
+        if item.get_closest_marker("corners") and any(item.callspec.indices.values()):
+            item.add_marker("long")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -98,6 +98,7 @@ def test_a_page_says_how_it_ended(logs: Logs, page: Page, tmp_path: Path, kind: 
     assert page.problems == []
 
 
+@pytest.mark.long
 def test_a_picture_of_each(logs: Logs, tmp_path: Path) -> None:
     for kind, log in logs.items():
         picture = build([log], tmp_path / f"{kind}.png", verify=False).path

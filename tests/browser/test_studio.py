@@ -52,6 +52,7 @@ def boxes(page: Page) -> list[list[float]]:
     return found
 
 
+@pytest.mark.long
 def test_a_log_in_every_panel(browser: Browser, log: Path, tmp_path: Path) -> None:
     if not has_packages("@foxglove/studio-base/package.json", "react", "react-dom"):
         pytest.skip(MISSING)

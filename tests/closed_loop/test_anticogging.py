@@ -69,6 +69,7 @@ def ripple(ticks: TickArray) -> float:
     return float(np.sqrt(np.mean((own["w"] - own["w_ref"]) ** 2)))
 
 
+@pytest.mark.long
 def test_the_plants_harmonics_are_found_within_their_intervals() -> None:
     _, found = taught()
     assert found.known.orders == tuple(sorted(COGGING))

@@ -12,6 +12,7 @@ from benchmarks.data_sheet import draws, holds, identified, prepared, tuned
 from benchmarks.motors import MOTORS, NAMES, WRONG
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_the_dip_is_as_predicted_with_the_identified_motor_alone(tmp_path: Path) -> None:
     """22 kW: the data sheet has psi_f too large and J too small, so the commands are too weak."""

@@ -94,6 +94,7 @@ def test_a_supply_that_limits_is_ridden_through_with_wider_intervals() -> None:
     assert not b_f.told and "friction falls with speed" in b_f.why and session.motor.B_f_n_m_s == 2e-4
 
 
+@pytest.mark.long
 def test_an_echo_that_lags_is_named_and_told_in_ticks() -> None:
     """The ticks of a drive that echoes each command a period after it has taken it."""
     config = load_toml(CONFIGS / "demo.toml", RunConfig, ())

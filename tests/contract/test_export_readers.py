@@ -262,6 +262,7 @@ def test_an_export_has_the_rights_that_the_users_umask_gives(path: Path, tmp_pat
     assert path.stat().st_mode & 0o777 == 0o600
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_memory_of_mat_does_not_grow_with_the_log(tmp_path: Path) -> None:
     """Four times the ticks, 200 MB more of them, take less than a quarter of that more."""

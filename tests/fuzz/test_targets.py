@@ -50,6 +50,7 @@ def test_deliberate_breaks_of_guard_and_client_are_noticed() -> None:
     assert done.stdout.count(" input ") > 20
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 @pytest.mark.parametrize(
     "more", [["--inputs", "100"], ["--inputs", "60", "--unchecked"]], ids=["as is", "unchecked"]

@@ -46,6 +46,7 @@ def test_a_second_run_is_refused_and_the_first_goes_on(
     assert not list((tmp_path / "second").glob("*"))
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("frame", [(0x080, b"\1"), (0x201, bytes(8))])
 def test_a_controller_elsewhere_is_heard_and_left_alone(
     configs: Path, settings: Settings, channel: str, frame: tuple[int, bytes]

@@ -97,6 +97,7 @@ def test_the_run_stops_when_standard_input_closes(configs: Path, settings: Setti
     assert_stopped_safely(only_log(tmp_path))
 
 
+@pytest.mark.long
 def test_the_run_stops_a_second_after_the_key_is_let_go(
     configs: Path, settings: Settings, tmp_path: Path
 ) -> None:
@@ -241,6 +242,7 @@ def assert_silent(path: Path, least: int) -> None:
     assert (log.ticks["state"] == DriveState.OPERATION_ENABLED).sum() > least
 
 
+@pytest.mark.long
 def test_a_shadow_without_another_controller_waits_and_sends_nothing(
     configs: Path, settings: Settings, tmp_path: Path, channel: str
 ) -> None:

@@ -43,6 +43,7 @@ def axes(configs: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_two_axes_turn_by_themselves(configs: Path, settings: Callable[..., tuple[str, ...]]) -> None:
     """Two emulators, each with its own motor: each axis comes to its own speed, and both replay."""
     path, own = axes(configs), settings("loop.duration_s=0.9", "loop.rate_hz=500")

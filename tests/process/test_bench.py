@@ -17,6 +17,7 @@ def bench(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_a_quick_bench_measures_everything(tmp_path: Path, channel: str) -> None:
     earlier = tmp_path / "earlier.json"

@@ -76,6 +76,7 @@ def until(what: str, seconds: float = 240.0) -> Iterator[None]:
     pytest.fail(f"never: {what}")
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("victim", ["worker", "source"])
 def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path, victim: str) -> None:
     """What is killed: a worker, or what workers are forked off."""
@@ -128,6 +129,7 @@ def test_ctrl_c_while_everything_is_imported_is_one_line(tmp_path: Path) -> None
     assert process.communicate(timeout=120) == ("", "hil: interrupted\n")
 
 
+@pytest.mark.long
 def test_a_script_that_guards_nothing_runs_once(tmp_path: Path) -> None:
     script = tmp_path / "script.py"
     arguments = f"{str(plan_file(tmp_path, 0.5))!r}, {str(tmp_path / 'out')!r}, workers=1"
@@ -164,6 +166,7 @@ def joined(address: str) -> Iterator[None]:
     yield
 
 
+@pytest.mark.long
 def test_a_worker_of_another_version_is_refused_by_name_and_an_equal_one_taken(tmp_path: Path) -> None:
     """The other one's sources differ in a comment: two states may have one version."""
     other, known = tmp_path / "other", tmp_path / "scheduler.json"
@@ -195,6 +198,7 @@ def test_a_worker_of_another_version_that_comes_later_runs_nothing() -> None:
         run_batch(None, {**identity(), "numpy": "0"}, 0, 1)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_a_fault_script_is_an_axis(tmp_path: Path) -> None:
     """Those cases go over the bus in lockstep; a fault that never comes leaves a simulation's figures."""
     path = tmp_path / "plan.toml"

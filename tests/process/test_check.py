@@ -65,6 +65,7 @@ def test_a_sync_drive_is_ready_and_nothing_is_sent(configs: Path, settings: Sett
     assert all(bool(r["remedy"]) == (r["verdict"] != "pass") for r in rows.values())
 
 
+@pytest.mark.long
 def test_a_cyclic_drive_shows_everything(configs: Path, settings: Settings) -> None:
     """It listens for 5 s: if the host holds the emulator up for up to half a second, no verdict changes."""
     own = settings("drive.heartbeat_timeout_s=5.0", 'loop.pacing="feedback"')
@@ -90,6 +91,7 @@ def test_an_interface_that_is_not_there(configs: Path, settings: Settings) -> No
     assert rows["drive"]["verdict"] == "fail"
 
 
+@pytest.mark.long
 def test_a_slow_pll_is_refused_unless_it_is_told(configs: Path, settings: Settings) -> None:
     """VESC's default PLL: a run that does not know it is refused; one that knows it is told its margins."""
     pll = 'kind="pll",pole_1_rad_s=15.0,pole_2_rad_s=1985.0'

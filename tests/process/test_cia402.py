@@ -60,6 +60,7 @@ def test_the_demo_closes_the_loop(path: Path, settings: Settings) -> None:
     assert np.isnan(ticks["i_d"]).all() and (ticks["drive_state"] == DriveState.OPERATION_ENABLED).any()
 
 
+@pytest.mark.long
 def test_a_drive_that_lost_its_mapping_is_found_before_arming(
     path: Path, settings: Settings, channel: str
 ) -> None:

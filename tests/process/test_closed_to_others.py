@@ -112,6 +112,7 @@ def bench(
         yield made
 
 
+@pytest.mark.long
 def test_files_and_shared_memory_are_the_users_alone(bench: Bench) -> None:
     web = bench.start("watch", "--web", "--port", "0")
     until(web, "http://")

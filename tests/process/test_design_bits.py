@@ -57,6 +57,7 @@ def designed(env: dict[str, str]) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.process
 @pytest.mark.beside
 def test_a_design_has_the_same_bits_under_every_kind_of_blas_and_processor() -> None:

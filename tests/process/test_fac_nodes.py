@@ -47,6 +47,7 @@ def nodes_of(result: dict[str, Any]) -> tuple[Log, Log]:
     return tuple(open_log(Path(result["log"]), node=name) for name in ("motor", "load"))  # type: ignore[return-value]
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("motor_at", [0, 1])
 def test_one_law_commands_both(configs: Path, settings: Settings, motor_at: int, tmp_path: Path) -> None:
     """The speed is held against a load that nobody tells of, by the load machine; i_q stays what is asked."""
@@ -76,6 +77,7 @@ def test_one_law_commands_both(configs: Path, settings: Settings, motor_at: int,
     assert sent[2:302] == order * 100, "commanded in the file's order, whoever commands"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("faulty", "other"), [(1, 0), (0, 1)])
 def test_a_fault_of_one_stops_both(configs: Path, settings: Settings, faulty: int, other: int) -> None:
     """Also where the law that commands both is the other one's: neither has a torque from that tick on."""
@@ -92,6 +94,7 @@ def test_a_fault_of_one_stops_both(configs: Path, settings: Settings, faulty: in
     assert [(f.can_id, f.data) for f in sent] == [(SYNC, b""), (MOTOR, OFF[0]), (LOAD, OFF[0])]
 
 
+@pytest.mark.long
 def test_a_limit_of_the_load_machine_is_told(configs: Path, settings: Settings) -> None:
     """Its guard cuts off what its limits no longer allow: the law is told what it gives, and flags it."""
     own = (*LOCKSTEP, f"drive.0.{MOVING}", "drive.0.limits.T_L_max_n_m=2.0")
@@ -106,6 +109,7 @@ def test_a_limit_of_the_load_machine_is_told(configs: Path, settings: Settings) 
     assert as_load < 0.7, "of 3.4 N m that are cut off none is a load: k_t and J are 5 and 15 % off"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_if_report_and_export_have_both(
     configs: Path, settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -133,6 +137,7 @@ def test_what_if_report_and_export_have_both(
     assert (tmp_path / "run.csv").is_file() and (tmp_path / "run.load.csv").is_file() and page.is_file()
 
 
+@pytest.mark.long
 def test_another_log_does_not_say_what_each_told_the_other(
     configs: Path, settings: Settings, capsys: pytest.CaptureFixture[str]
 ) -> None:

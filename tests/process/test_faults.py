@@ -43,6 +43,7 @@ def test_rows_in_lockstep(tmp_path: Path) -> None:
     assert text.count("<figure>") == len(rows) and "http" not in text
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("drive", "names", "safe_ms"),
     [
@@ -63,6 +64,7 @@ def test_rows_of_drives_by_others(
     assert [one if one is None else round(one) for one in found] == safe_ms
 
 
+@pytest.mark.long
 def test_rows_of_two_nodes(tmp_path: Path) -> None:
     """What happens to one stops the other in the same tick; both have their say in the row."""
     path = CONFIGS / "faults/dyno.toml"
@@ -129,6 +131,7 @@ def test_of_one_drive_no_fault_names_a_node() -> None:
         check_rows(CONFIGS / "demo.toml", matrix(), [bad])
 
 
+@pytest.mark.long
 def test_rows_in_real_time(tmp_path: Path) -> None:
     only = ["--only", "writer killed", "--only", "disk full"]
     code, rows = run(CONFIGS / "faults.toml", tmp_path, *only)

@@ -161,6 +161,7 @@ def named(value: object) -> str:
     return "+".join(kind.__name__ for kind in value) if isinstance(value, tuple) else ""
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("bursts", [True, False], ids=["bursts", "full-speed"])
 def test_frames_of_nobody_are_ridden_through(begin: Callable[[], Bench], bursts: bool) -> None:
     """2500 frames a second are nothing; more than the sockets hold may end in a stop for what was lost."""
@@ -179,6 +180,7 @@ def test_frames_of_nobody_are_ridden_through(begin: Callable[[], Bench], bursts:
     bench.assert_drive_is_at_rest()
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("kinds", "bursts", "reasons"),
     [

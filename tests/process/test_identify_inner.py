@@ -92,6 +92,7 @@ def watched(log: Path, wire: Wire, config: RunConfig) -> float:
     return float(np.abs(sent).max())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "steps"),
     [
@@ -124,6 +125,7 @@ def test_a_drive_with_a_loop_of_its_own_over_the_bus(configs: Path, name: str, s
         assert row["value"] == pytest.approx(p[key.lower()]["value"], rel=0.02, abs=1e-4), key
 
 
+@pytest.mark.long
 def test_an_open_phase_behind_a_current_loop_is_named_by_the_current_that_nobody_asked_for(
     configs: Path,
 ) -> None:

@@ -17,6 +17,7 @@ pytestmark = [pytest.mark.process, pytest.mark.beside, pytest.mark.slow]
 NAME = "5.5 kW interior"
 
 
+@pytest.mark.long
 def test_the_dip_on_a_soft_coupling_is_as_predicted(tmp_path: Path) -> None:
     true, more = dict(zip(NAMES, MOTORS[NAME], strict=True)), MORE[NAME]
     path, file = tmp_path / "demo.toml", tmp_path / "identified.toml"

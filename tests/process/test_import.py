@@ -97,6 +97,7 @@ def test_fac_on_can_fd_there_and_back(two_inputs: Ran, tmp_path: Path, ending: s
     assert max(len(frame.data) for frame in open_log(back).frames) > 8
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
 def test_a_run_in_real_time_comes_back_in_all_but_its_times(tmp_path: Path, name: str) -> None:
     """Lateness, skipped periods and late feedback of a busy host included; with SYNC and without."""

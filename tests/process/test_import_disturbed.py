@@ -61,6 +61,7 @@ def stopped_at_random(pid: int, seed: str) -> Iterator[None]:
             os.kill(pid, signal.SIGCONT)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("who", ["controller", "drive"])
 @pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
 def test_a_run_that_was_stopped_again_and_again_comes_back(tmp_path: Path, name: str, who: str) -> None:

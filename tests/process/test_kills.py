@@ -12,6 +12,7 @@ from tests.conftest import ROOT
 pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.slow]
 
 
+@pytest.mark.long
 def test_every_kill_leaves_a_drive_at_rest_and_a_log() -> None:
     command = [sys.executable, "-m", "tests.crash.kills", "--kills", "8", "--delays", "10", "--seed", "7"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False)

@@ -45,6 +45,7 @@ def until(condition: Callable[[], object], within_s: float) -> bool:
     return False
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
 @pytest.mark.parametrize("after_s", [0.0, 0.3, 3.0])
 def test_a_demo_that_is_ended_leaves_no_emulator(
@@ -64,6 +65,7 @@ def test_a_demo_that_is_ended_leaves_no_emulator(
         demo.wait()
 
 
+@pytest.mark.long
 def test_a_signal_is_heard_however_long_a_tick_waits(
     configs: Path, settings: Settings, tmp_path: Path
 ) -> None:

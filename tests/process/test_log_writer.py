@@ -110,6 +110,7 @@ def gone(pid: int) -> bool:
         return True
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("seed", range(4))
 def test_nothing_is_lost_when_the_controller_is_killed(tmp_path: Path, seed: int) -> None:
     path, lives_s = tmp_path / "run.mcap", random.Random(seed).uniform(0.05, 1.0)
@@ -126,6 +127,7 @@ def test_nothing_is_lost_when_the_controller_is_killed(tmp_path: Path, seed: int
     assert log.ticks.tobytes() == some_ticks(4000)[: len(log.ticks)].tobytes(), f"seed {seed}"
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("seed", range(3))
 def test_a_killed_writer_is_noticed_and_its_file_reads_to_the_last_second(tmp_path: Path, seed: int) -> None:
     """Also a slow run's, whose chunks close by time and not by size."""

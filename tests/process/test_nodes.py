@@ -85,6 +85,7 @@ def assert_one_sync_a_tick(log: Log) -> None:
     assert heard.count(0x185) == heard.count(0x186) == len(log.ticks), "each frame once"
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(("faulty", "other"), [(1, 0), (0, 1)])
 def test_a_fault_of_one_stops_all(configs: Path, settings: Settings, faulty: int, other: int) -> None:
     """The other one is stopped in the same tick, with a reason of its own; in the file's order."""
@@ -107,6 +108,7 @@ def test_a_fault_of_one_stops_all(configs: Path, settings: Settings, faulty: int
     assert open_log(Path(result["log"]), node=names[other]).result["ended"] == "node_stopped"
 
 
+@pytest.mark.long
 def test_the_second_node_s_reference_is_set_while_it_runs(
     configs: Path, settings: Settings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -208,6 +210,7 @@ def until_left(bus: can.BusABC) -> dict[int, list[bytes]]:
     return sent
 
 
+@pytest.mark.long
 def test_the_check_looks_at_both(configs: Path, settings: Settings) -> None:
     """Nobody has set the drives up: so says the check of each, and a run is refused."""
     path, own = configs / "dyno.toml", settings(*LOCKSTEP)

@@ -73,6 +73,7 @@ def test_a_drive_that_dies_stops_the_run(patient: Path, settings: Settings) -> N
     assert Reason[ended.upper()] not in (Reason.STOP_REQUESTED, Reason.QUICK_STOP_REQUESTED), ended
 
 
+@pytest.mark.long
 def test_a_shadow_beside_a_controller_sends_nothing_and_computes_the_same(
     patient: Path, settings: Settings, tmp_path: Path, channel: str
 ) -> None:
@@ -100,6 +101,7 @@ def test_a_shadow_beside_a_controller_sends_nothing_and_computes_the_same(
     assert_silent(only_log(folder), least=1000)
 
 
+@pytest.mark.long
 def test_check_sees_it_by_its_own_names(patient: Path, settings: Settings) -> None:
     own = settings("drive.heartbeat_timeout_s=1.0")
     with emulator_process(patient, Overrides(settings=own)):

@@ -25,6 +25,7 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new))
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("last", [14, 12])
 def test_a_run_goes_on_where_the_counter_wraps(configs: Path, settings: Settings, last: int) -> None:
     """The drive's own DBC counts to 15; the run's to less, as AUTOSAR's does."""
@@ -71,6 +72,7 @@ def test_feedback_of_another_length_is_named_before_arming(
     assert checked.returncode == 1 and "FEEDBACK: length 6, DBC 8" in checked.stdout.replace("\n", " ")
 
 
+@pytest.mark.long
 def test_feedback_of_another_length_ends_a_run_with_both_lengths(configs: Path, settings: Settings) -> None:
     """A drive that answers SYNC is heard in the run's first ticks."""
     edit(configs / "plants/demo.toml", "hil_pmsm.dbc", "theirs.dbc")

@@ -97,6 +97,7 @@ def test_the_demo_says_what_happened(configs: Path, settings: Settings) -> None:
 PLL = '{kind="pll",pole_1_rad_s=1000.0,pole_2_rad_s=1000.0}'
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("name", "more", "plant"),
     [
@@ -125,6 +126,7 @@ def test_lockstep_twice_and_simulated_are_the_same_to_the_bit(
         assert first == simulated[field.name].tobytes(), field.name
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_stop_safely(
     configs: Path, settings: Settings, tmp_path: Path, number: signal.Signals
@@ -255,6 +257,7 @@ def test_one_flipped_bit_is_found(configs: Path, settings: Settings, tmp_path: P
     assert found.tick == row and found.field in ("d_hat_w", "d_hat_q") and found.ulp > 0
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("pacing", ["timer", "feedback"])
 def test_a_drive_that_takes_no_sync(configs: Path, settings: Settings, pacing: str, tmp_path: Path) -> None:
     own = settings(f'loop.pacing="{pacing}"', "loop.duration_s=2.0", "reference.w_rad_s=30.0")

@@ -82,6 +82,7 @@ def test_without_a_run_and_with_two_it_is_said(configs: Path, settings: Settings
     assert refused.returncode == 2 and "no run of this user is running" in refused.stderr
 
 
+@pytest.mark.long
 def test_a_second_ctrl_c_cuts_the_ramp(configs: Path, settings: Settings, tmp_path: Path) -> None:
     own = settings("loop.duration_s=120.0", "stop.ramp_rad_s2=10.0", "stop.ramp_max_s=60.0")
     path = configs / "demo.toml"

@@ -11,6 +11,7 @@ from tests.soak.run import Track, findings, process_findings, show
 pytestmark = [pytest.mark.process, pytest.mark.alone, pytest.mark.slow]
 
 
+@pytest.mark.long
 def test_twenty_seconds_lose_nothing_and_grow_nothing(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

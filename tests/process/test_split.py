@@ -245,6 +245,7 @@ def writer_of(pid: int) -> int:
     raise AssertionError("there is no writer")
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("who", ["writer", "controller"])
 def test_killed_right_at_a_split(configs: Path, settings: Settings, tmp_path: Path, who: str) -> None:
     """The moment at which the second part appears; what was written before is there and replays."""
@@ -272,6 +273,7 @@ def test_killed_right_at_a_split(configs: Path, settings: Settings, tmp_path: Pa
         assert log.damage is None and log.result["ended"] == "controller died"
 
 
+@pytest.mark.long
 def test_an_adaptive_window_is_the_same_on_the_bus_and_in_a_part_that_begins_in_its_growth(
     tmp_path: Path,
 ) -> None:

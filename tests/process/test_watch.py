@@ -153,6 +153,7 @@ def resized(fd: int, columns: int, rows: int) -> list[str]:
     return lines
 
 
+@pytest.mark.long
 def test_the_terminal_is_resized(configs: Path, settings: Settings, channel: str) -> None:
     own, path = settings("loop.duration_s=90.0"), configs / "demo.toml"
     with emulator_process(path, Overrides(settings=own)), hil("run", str(path), *flags(own)) as process:
@@ -178,6 +179,7 @@ def test_the_terminal_is_resized(configs: Path, settings: Settings, channel: str
             os.close(fd)
 
 
+@pytest.mark.long
 def test_keys_in_the_terminal_leave_and_stop(
     configs: Path, settings: Settings, tmp_path: Path, channel: str
 ) -> None:

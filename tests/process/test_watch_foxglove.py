@@ -87,6 +87,7 @@ def check_what_foxgloves_client_got(found: dict[str, Any]) -> None:
     assert (ticks["k"][1:] > ticks["k"][:-1]).all()
 
 
+@pytest.mark.long
 @pytest.mark.process
 def test_a_client_gets_the_schemas_and_ticks_of_the_log_files(
     configs: Path, settings: Settings, tmp_path: Path, channel: str, monkeypatch: pytest.MonkeyPatch

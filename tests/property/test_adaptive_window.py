@@ -242,6 +242,7 @@ def test_the_first_length_is_for_a_full_window_alone() -> None:
         assert s["length"][0] == after
 
 
+@pytest.mark.long
 def test_first_alarms_at_every_chance_upset_no_corner() -> None:
     """Dwell: the loop over one cycle of rest, first length and growth contracts, in all corners of +-30 %.
 

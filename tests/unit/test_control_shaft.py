@@ -93,6 +93,7 @@ def test_margins_and_verdict_of_a_design_are_those_on_the_known_shaft() -> None:
     assert judge(law, bench).worst.stable
 
 
+@pytest.mark.compiled
 def test_no_ringing_in_the_estimate_of_a_simulated_run() -> None:
     """3 N m on the load behind 60 Hz, resolution of the frames and noise of the sensors with it."""
     setups = [load_setup(CURRENT, Overrides(settings=(SLOW, *more))) for more in ((KNOWN,), ())]

@@ -106,6 +106,7 @@ def fitted(samples: Samples, hz: float) -> Fit:
     return fit(samples, replace(TRUE, R_s=3.0, J=0.011), start)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_the_intervals_hold_the_truth_on_a_coupling() -> None:
     """Of 20 runs those of resonance, damping, ratio, J, R_s, L_q and friction in nine of ten, near 95 %."""

@@ -171,6 +171,7 @@ def emulated(motor: MotorModel, coulomb: float, load: float, scale: Array, rando
     return Samples(T, np.arange(count) * T, y, u, begins, np.ones(count, bool), np.zeros(count))
 
 
+@pytest.mark.long
 def test_intervals_cover_over_two_hundred_emulated_motors() -> None:
     """95 % intervals of 8 parameters hold the truth in 95 % of the motors, and are no wider than it takes."""
     off = np.empty((MOTORS, 8))

@@ -91,6 +91,7 @@ def run(tree: Path, **environment: str) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.long
 @pytest.mark.compiled
 def test_a_change_compiles_what_depends_on_it_alone(tree: Path) -> None:
     assert run(tree) == "7.0 0 negative 2"

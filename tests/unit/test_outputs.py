@@ -126,6 +126,7 @@ def test_a_reader_that_leaves_ends_a_command_quietly(words: list[str], tmp_path:
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.corners
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT], ids=lambda number: number.name)
 def test_an_export_that_is_ended_leaves_nothing_behind(tmp_path: Path, number: signal.Signals) -> None:

@@ -144,6 +144,7 @@ def test_lateness_beyond_the_histogram_is_the_largest(path: Path) -> None:
     assert result.quantile_us(0.99) == result.max_us == 700_000.0 and result.quantile_us(0.5) == 1.0
 
 
+@pytest.mark.long
 def test_the_collector_does_not_look_at_old_objects_while_playing(path: Path) -> None:
     frozen = []
 

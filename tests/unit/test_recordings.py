@@ -370,6 +370,7 @@ def test_a_blf_file_out_of_order_is_ordered_and_says_so(tmp_path: Path) -> None:
     assert found.notes == ["1 times the stamps go back, by 0.019 s at most: ordered by time"]
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("share", [0.5, 0.9, 0.99])
 @pytest.mark.parametrize("ending", [".blf", ".mf4", ".log.gz"])
 def test_a_file_cut_off_says_how_much_is_missing(tmp_path: Path, ending: str, share: float) -> None:

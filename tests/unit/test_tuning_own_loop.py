@@ -215,6 +215,7 @@ def test_designs_that_can_not_be_are_refused(
     assert said in text and not out.exists()
 
 
+@pytest.mark.long
 @pytest.mark.process
 def test_a_design_is_verified_in_simulation_and_on_the_bus(tmp_path: Path) -> None:
     """The plant of the file and the motor that is believed in; corners differ from them by a setting."""
