@@ -50,12 +50,14 @@ def bus_load(frames: Iterable[tuple[float, float]]) -> float:
 def message_rates(binding: Binding, rate_hz: float, every: int = 1) -> list[tuple[Message, float]]:
     """How often each message of the map is on the bus [1/s], the loop running at ``rate_hz``.
 
-    SYNC and commands once a tick, measurements in each ``every``-th; others by the DBC's cycle time, which
-    for a drive that takes SYNC counts in SYNCs; heartbeats by their cycle time alone. Without: not counted.
+    SYNC and commands once a tick, but for those sent on change alone, which are not counted; measurements in
+    each ``every``-th; others by the DBC's cycle time, which for a drive that takes SYNC counts in SYNCs;
+    heartbeats by their cycle time alone. Without: not counted.
     """
     sync, beat = binding.sync, binding.heartbeat
     stretch = rate_hz * sync.cycle_ms / 1000.0 if sync and sync.cycle_ms else 1.0
-    rates = [(bound.message, rate_hz) for bound in binding.outgoing]
+    seldom = binding.map.on_change
+    rates = [(bound.message, rate_hz) for bound in binding.outgoing if bound.message.name not in seldom]
     rates += [(sync, rate_hz)] if sync else []
     for bound in binding.incoming:
         if any(part in MEASURED for part, _ in bound.parts):

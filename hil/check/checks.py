@@ -258,14 +258,18 @@ def canopen_rows(setup: Setup) -> list[Row]:
     config = setup.config
     if config.canopen is None:
         return []
-    from hil.runtime.configure import lost
+    from hil.runtime.configure import looked_at
 
     try:
-        problems = lost(setup.path, config, bus_settings(config), 0.0)
+        node = looked_at(setup.path, config, bus_settings(config), 0.0)
     except (DriverError, HilError) as error:
         return [Row("canopen", "fail", str(error), "see what it says; then hil configure, hil check")]
-    found = "; ".join(problems) or f"mode {config.canopen.mode}, every object as hil configure sets it"
-    return [row("canopen", not problems, found, f"set it: hil configure {setup.path}")]
+    if problems := "; ".join(node.problems):
+        return [Row("canopen", "fail", problems, f"set it: hil configure {setup.path}")]
+    found = f"mode {node.mode}, every object as hil configure sets it"
+    if node.fault is not None:
+        found += f"; it stands in fault, error {words(node.fault)}"
+    return [row("canopen", node.fault is None, found, "see to its cause; the next arming resets it")]
 
 
 def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:

@@ -45,6 +45,8 @@ class Result:
     dbc: Path | None = None
     written: bool = False
     stored: bool = False
+    fault: int | None = None
+    """Error code of a drive that stands in fault."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON form."""
@@ -71,6 +73,7 @@ class Result:
             "written": self.written,
             "stored": self.stored,
             "dbc": str(self.dbc) if self.dbc else None,
+            "fault": self.fault,
             "problems": self.problems,
             "ok": not self.problems,
         }
@@ -177,13 +180,13 @@ def compared(job: Job, sdo: Sdo) -> Result:
     return result
 
 
-def lost(path: Path, config: RunConfig, bus: BusSettings, wait_s: float) -> list[str]:
-    """What a node no longer holds of its set-up, before a run. Raises HilError or DriverError."""
+def looked_at(path: Path, config: RunConfig, bus: BusSettings, wait_s: float) -> Result:
+    """:func:`compared` before a run: what a node no longer holds, and its fault. Raises as it does."""
     job = job_of(path, config, bus)
     link = open_link(bus)
     try:
         node.await_node(link, job.node_id, wait_s)
-        return compared(job, job.sdo(link)).problems
+        return compared(job, job.sdo(link))
     finally:
         link.close()
 
@@ -231,9 +234,8 @@ def _result(job: Job, sdo: Sdo, scales: Scales) -> Result:
     objects = list(node.compare(sdo, job.plan))
     limits = limit_problems(job, sdo, scales)
     told, options = scales.told, node.options(sdo)
-    return Result(
-        job.node_id, str(job.eds.path), job.table.mode, identity, told, options, objects, limits, text
-    )
+    eds, mode, fault = str(job.eds.path), job.table.mode, node.fault_of(sdo)
+    return Result(job.node_id, eds, mode, identity, told, options, objects, limits, text, fault=fault)
 
 
 def _refuse_unkept(job: Job, result: Result) -> None:

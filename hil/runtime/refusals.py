@@ -11,6 +11,7 @@ from hil.log.recorder import BYTES_PER_TICK
 from hil.runtime.bus import bus_settings, is_emulated_bus
 from hil.runtime.progress import say
 from hil.runtime.setup import Setup
+from hil.tick.errorcodes import words
 
 MAX_LOAD = 0.7
 LOAD_REMEDY = f"keep it under {100 * MAX_LOAD:.0f} %: a lower loop.rate_hz, a higher bitrate, or CAN FD"
@@ -76,14 +77,20 @@ def check_load(setup: Setup) -> None:
 
 
 def check_set_up(setup: Setup) -> None:
-    """Refuse a CANopen drive that lost what hil configure has set; asks it by SDO. Raises ArmingError."""
+    """Refuse a CANopen drive that lost what hil configure has set; asks it by SDO. Raises ArmingError.
+
+    A fault in which it stands is told; arming resets it.
+    """
     config = setup.config
     if config.canopen is None or config.loop.shadow:
         return
-    from hil.runtime.configure import lost
+    from hil.runtime.configure import looked_at
 
-    problems = lost(setup.path, config, bus_settings(config), config.drive.heartbeat_timeout_s)
-    if problems:
+    found = looked_at(setup.path, config, bus_settings(config), config.drive.heartbeat_timeout_s)
+    if found.fault is not None:
+        error = words(found.fault)
+        say(f"warning: the drive stands in fault, error {error}: arming resets it; see to its cause")
+    if problems := found.problems:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
         raise ArmingError(
             f"the drive is not as hil configure sets it: {problems[0]}{more}; set it: hil configure "

@@ -14,9 +14,12 @@ import pytest
 from canopen import SdoAbortedError
 
 from drivers.errors import DatabaseError, NodeError
+from hil.check.checks import canopen_rows
 from hil.cli import main
 from hil.errors import ConfigError, HilError
-from hil.runtime.configure import Result, compare, configure, lost
+from hil.runtime.configure import Result, compare, configure, looked_at
+from hil.runtime.refusals import check_set_up
+from hil.runtime.setup import Overrides, load_setup
 from tests.canopen import EDS, NODE, bus_of, emulated, job, recorded, run_config, stranger
 
 pytestmark = pytest.mark.alone
@@ -107,7 +110,8 @@ def test_a_mapping_lost_at_power_off_is_found_and_one_stored_is_kept(configs: Pa
         reset(channel)
         problems = compare(made).problems
         assert "1A00h:2 is 0x0, not 0x606c0020 (TPDO1 carries 606Ch Velocity)" in problems
-        assert lost(run_config(configs), made.config, bus_of(channel), 0.0) == problems
+        found = looked_at(run_config(configs), made.config, bus_of(channel), 0.0)
+        assert found.problems == problems and found.fault is None
         assert set_up(configs, channel, store=True).stored
         reset(channel)
         assert compare(made).problems == []
@@ -253,6 +257,27 @@ def test_an_enabled_drive_is_left_alone(configs: Path, channel: str) -> None:
     with stranger(channel) as node:
         node.sdo[0x6041].raw = 0x0237
         assert "node 5 is enabled (6041h = 0x0237)" in refused_untouched(configs, channel)
+
+
+def test_a_drive_that_stands_in_fault_is_told_before_it_is_armed(
+    configs: Path, channel: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`hil check` fails, `hil run` says that arming resets it."""
+    with stranger(channel) as node:
+        node.sdo[0x6061].raw = 10
+        set_up(configs, channel)
+        node.sdo[0x6041].raw, node.sdo[0x603F].raw = 0x0218, 0x3210
+        assert compare(job(configs, channel)).fault == 0x3210
+        setup = load_setup(run_config(configs), Overrides(channel=channel))
+        (row,) = canopen_rows(setup)
+        check_set_up(setup)
+    assert row.verdict == "fail" and row.found.endswith(
+        "it stands in fault, error 0x3210, DC link over-voltage"
+    )
+    assert (
+        "the drive stands in fault, error 0x3210, DC link over-voltage: arming resets it"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_drive_without_the_mode(configs: Path, channel: str) -> None:

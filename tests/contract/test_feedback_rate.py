@@ -193,6 +193,7 @@ def test_the_load_and_the_rate_of_the_bus_are_those_of_seldom_measurements() -> 
     setup = load_setup(ODRIVE, asked())
     rates = {m.name: rate for m, rate in message_rates(setup.binding, 1000.0, setup.config.feedback_every)}
     assert (rates["Get_Encoder_Estimates"], rates["Set_Input_Torque"]) == (200.0, 1000.0)
+    assert "Set_Axis_State" not in rates, "it is sent when it changes"
     heard = Heard(count=101, first_ns=1, last_ns=500_000_001)
     assert feedback_row(heard, 200.0, False, "feedback.period_ms").verdict == "pass"
     wrong = feedback_row(heard, 1000.0, False)
