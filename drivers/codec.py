@@ -56,6 +56,8 @@ class Message:
         self.start = _starts(parsed, statements, raw_id)
         self.unwatched = statements.attribute("Unwatched", raw_id) or ""
         """Why a drive that is commanded by it does not miss its master; empty where it does."""
+        self.set_by = statements.attribute("SetBy", raw_id) or ""
+        """The drive's own parameter of how often it sends it [ms]."""
         self.profile, self.data_ids = _protection(statements, raw_id, where)
         if self.profile and self.length < 3:
             raise DatabaseError(f"{where}: {self.length} bytes leave no room for E2E profile {self.profile}")

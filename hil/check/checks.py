@@ -281,6 +281,7 @@ def traffic_rows(setup: Setup, traffic: Traffic) -> list[Row]:
     return [
         drive_row(traffic, setup.binding, config.drive.heartbeat_timeout_s, asked),
         *feedback_rows(setup, traffic, silent_ok),
+        *([] if silent_ok else unheard_rows(traffic, setup.binding)),
         frames_row(traffic),
         *length_rows(traffic, setup.binding),
         *started_rows(setup.binding),
@@ -298,11 +299,23 @@ def feedback_rows(setup: Setup, traffic: Traffic, silent_ok: bool) -> list[Row]:
     config, parts = setup.config, setup.binding.incoming
     rate_hz, every = config.loop.rate_hz / config.feedback_every, config.feedback_every
     what = "loop" if every == 1 else "feedback.period_ms"
-    names = [b.message.name for b in parts if any(part in MEASURED for part, _ in b.parts)]
-    rows = [feedback_row(traffic.of(name), rate_hz, silent_ok, what) for name in names]
+    measuring = [b.message for b in parts if any(part in MEASURED for part, _ in b.parts)]
+    rows = [feedback_row(traffic.of(m.name), rate_hz, silent_ok, what, m.set_by) for m in measuring]
     if len(rows) == 1:
         return rows
-    return [replace(r, check=f"{r.check} {name}") for name, r in zip(names, rows, strict=True)]
+    return [replace(r, check=f"{r.check} {m.name}") for m, r in zip(measuring, rows, strict=True)]
+
+
+def unheard_rows(traffic: Traffic, binding: Binding) -> list[Row]:
+    """One row for each slower message that a drive which speaks does not send, and by what it is set."""
+    if not any(traffic.of(bound.message.name).count for bound in binding.incoming):
+        return []
+    slow = [b.message for b in binding.incoming if all(part not in MEASURED for part, _ in b.parts)]
+    return [
+        Row(f"rate {m.name}", "fail", f"no {m.name}", f"set {m.set_by} = {m.cycle_ms:g} in the drive")
+        for m in slow
+        if m.set_by and m.cycle_ms and traffic.of(m.name).count == 0
+    ]
 
 
 def drive_row(traffic: Traffic, binding: Binding, seconds: float, asked: bool = False) -> Row:
@@ -318,15 +331,27 @@ def drive_row(traffic: Traffic, binding: Binding, seconds: float, asked: bool = 
     return row("drive", bool(names), found, remedy)
 
 
-def feedback_row(feedback: Heard, rate_hz: float, silent_ok: bool, what: str = "loop") -> Row:
-    """Does feedback come at the rate of the loop, or at that of feedback.period_ms."""
+def feedback_row(
+    feedback: Heard, rate_hz: float, silent_ok: bool, what: str = "loop", set_by: str = ""
+) -> Row:
+    """Does feedback come at the rate of the loop, or at that of feedback.period_ms.
+
+    ``set_by``: the drive's parameter of it, [ms].
+    """
+    own = f"set {set_by} = {1000.0 / rate_hz:g} in the drive" if set_by else ""
     if feedback.count == 0:
         if silent_ok:
             return Row("feedback rate", "warn", "no feedback: it comes with SYNC only", SILENT)
-        return Row("feedback rate", "fail", "no feedback", "switch on the drive's cyclic transmission")
+        remedy = own or "switch on the drive's cyclic transmission"
+        return Row("feedback rate", "fail", "no feedback", remedy)
     near = abs(feedback.rate_hz / rate_hz - 1.0) <= RATE_TOLERANCE
     found = f"{feedback.rate_hz:.0f} Hz, {what} {rate_hz:g} Hz"
-    return row("feedback rate", near, found, "set loop.rate_hz, the drive's cycle time or feedback.period_ms")
+    remedy = (
+        f"{own}, or feedback.period_ms"
+        if own
+        else "set loop.rate_hz, the drive's cycle time or feedback.period_ms"
+    )
+    return row("feedback rate", near, found, remedy)
 
 
 def frames_row(traffic: Traffic) -> Row:

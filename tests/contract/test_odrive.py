@@ -17,9 +17,11 @@ import pytest
 from drivers.bus import BusSettings, Frame, Link, SocketLink, open_link
 from drivers.client import DriveClient
 from drivers.errors import DatabaseError, LinkError
+from drivers.listen import Heard, Traffic
 from drivers.oneshot import NoAnswer
 from drivers.wire import FRAME
 from firmware_model.odrive import ODriveFrames
+from hil.check.checks import traffic_rows
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import Controlword, DriveState, new_ticks
 from tests.conftest import CONFIGS
@@ -222,6 +224,24 @@ def test_a_mistake_of_the_map_is_one_line(setting: str, said: str) -> None:
     with pytest.raises(DatabaseError) as caught:
         setup_of(setting)
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_check_names_the_parameter_that_switches_a_message_on() -> None:
+    """As shipped the drive sends estimates every 10 ms, and neither currents nor its supply."""
+    beat, estimates = Heard(count=11, last_ns=10**9), Heard(count=101, last_ns=10**9)
+    traffic = Traffic({"Heartbeat": beat, "Get_Encoder_Estimates": estimates})
+    rows = {row.check: row for row in traffic_rows(setup_of(), traffic)}
+    remedies = {check: row.remedy for check, row in rows.items() if "msg_rate_ms" in row.remedy}
+    own = "<axis>.config.can"
+    assert remedies == {
+        "feedback rate Get_Encoder_Estimates":
+            f"set {own}.encoder_msg_rate_ms = 1 in the drive, or feedback.period_ms",
+        "feedback rate Get_Iq": f"set {own}.iq_msg_rate_ms = 1 in the drive",
+        "rate Get_Bus_Voltage_Current": f"set {own}.bus_voltage_msg_rate_ms = 10 in the drive",
+        "rate Get_Temperature": f"set {own}.temperature_msg_rate_ms = 10 in the drive",
+    }  # fmt: skip
+    silent = traffic_rows(setup_of(), Traffic())
+    assert not [row for row in silent if row.check.startswith("rate ")], "the row drive says it"
 
 
 @pytest.mark.compiled
