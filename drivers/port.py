@@ -38,12 +38,12 @@ class Saved(NamedTuple):
 class Compiled(NamedTuple):
     """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
 
-    ``exchange``, ``follow`` and ``command`` are places, ``exchange`` None for a drive without SYNC;
+    ``exchange``, ``receive`` and ``command`` are places, ``exchange`` None for a drive without SYNC;
     ``sync_bytes``: size of SYNC's frame, ``log``: the frames.
     """
 
     exchange: npt.NDArray[np.int64] | None
-    follow: npt.NDArray[np.int64]
+    receive: npt.NDArray[np.int64]
     command: npt.NDArray[np.int64]
     sync_bytes: int
     log: npt.NDArray[np.void]

@@ -2,10 +2,10 @@
 
 Between two ticks the caches go cold, and an interpreter pays for every step: the loop's own Python took as
 long as all that it calls. This is a part of the composition root, since it calls the kernels behind the
-ports. Its rules are those of :mod:`hil.runtime.rules`; SYNC and feedback are :func:`drivers.posix.exchange`,
-law, supervisor and guard :func:`hil.tick.kernel.whole_at`, the command :func:`drivers.posix.command`, the
-records :func:`hil.log.push.push`, and the guardian's words as its :class:`~hil.runtime.guardian.GuardedDrive`
-keeps them.
+ports. Here are the parts of :func:`hil.runtime.rules.run_tick`: SYNC and feedback are
+:func:`drivers.posix.exchange`, law, supervisor and guard :func:`hil.tick.kernel.whole_at`, the command
+:func:`drivers.posix.command`, the records :func:`hil.log.push.push`, and the guardian's words as its
+:class:`~hil.runtime.guardian.GuardedDrive` keeps them.
 At the first thing that is unusual it returns the stage that it reached, and the loop does the rest. Some
 ticks run in one call, without Python in between: what others may ask of a run meanwhile is memory that is
 looked at before each tick.
@@ -13,6 +13,7 @@ looked at before each tick.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -39,40 +40,36 @@ from drivers.posix import (
     clock_ns,
     command,
     drain,
-    exchange,
     now_ns,
 )
+from drivers.posix import exchange as sync_and_drain
 from drivers.wire import STATE
 from hil.config.design import Machine
 from hil.log.push import HEADER, NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.log.ring import FAILED_AT
 from hil.runtime.guardian import FIRED, Words, beats, commands, guardian_flags
-from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, wait_ns
+from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, timing_of
 from hil.runtime.rules import (
-    ARRIVED,
-    BEGUN,
-    COUNTER_JUMP,
-    DECIDED,
-    DID,
+    END,
     LOST,
-    NEVER,
+    NEWS,
     NEXT,
     NOT_BEGUN,
+    PERIOD_NS,
+    PLANNED,
     RAN,
     RECORDED,
-    SENT,
     STEER_EVERY,
+    SYNC_BYTES,
+    TOGETHER,
     Pace,
+    Timing,
     asked_in,
-    begin,
-    bounded,
-    count,
-    is_due,
     is_news,
-    newest,
-    stamp,
-    wake,
+    rule,
+    run_tick,
+    since,
 )
 from hil.signals import TICK, TickArray
 from hil.tick.kernel import whole_at
@@ -81,7 +78,7 @@ PHASES: Final = (
     "loop", "sleep", "sync, receive, check, decode", "control and guard", "encode, send", "record",
 )  # fmt: skip
 """Where a tick's processor time goes; ``loop`` is what lies between two calls."""
-LOOP, SLEEP, READ, CONTROL, SEND, RECORD = range(6)
+LOOP, SLEEP, READING, CONTROL, SEND, RECORD = range(6)
 LAST: Final = len(PHASES)
 """Behind the phases' sums: the thread's processor time at the last border."""
 Marks = npt.NDArray[np.int64]
@@ -99,7 +96,8 @@ I8: Final = np.dtype(np.int64)
     ROWS,
 ) = range(14)  # fmt: skip
 """Rows of the table: places of the kernels' own tables of places, then of arrays."""
-PERIOD_NS, TIMEOUT_NS, SYNC_BYTES, END, WAIT_NS, EVERY, TOGETHER, FOLLOWS, PLANNED = range(9)
+PARTS: Final = sys.modules[__name__]
+"""The parts of a tick are functions of this module; a kernel takes a module, but no tuple of functions."""
 TOGETHER_NS: Final = 4_000_000
 """How long ticks go on without Python: a signal that comes while none of them waits is late by so much."""
 
@@ -120,17 +118,17 @@ def whole_tick(
     number: memoryview | None = None,
     marks: Marks | None = None,
 ) -> Whole:
-    """The ticks of a run on a socket, paced by SYNC or feedback in real time; others are the loop's alone.
+    """The ticks of a run on a socket in real time; others are the loop's alone.
 
     The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
     ``number``: of the newest set-point that was asked for, in memory that outlives the run; no array of it
     stays, which would keep it from being released.
     """
     ports = client.compiled()
-    receive = None if ports is None else {"sync": ports.exchange, "feedback": ports.follow}.get(plan.pacing)
+    receive = None if ports is None else ports.exchange if plan.pacing == "sync" else ports.receive
     if ports is None or receive is None:
         return none_compiled
-    timing = timing_of(plan, ports.sync_bytes, client.timed is not None)
+    timing = timing_of(plan, client.timed is not None, ports.sync_bytes)
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
     table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks)
     call = partial(_compiled(), table)
@@ -138,19 +136,9 @@ def whole_tick(
     return call
 
 
-def timing_of(plan: Plan, sync_bytes: int, timed: bool) -> npt.NDArray[np.int64]:
-    """The plan, as compiled ticks read it."""
-    end = NEVER if plan.ticks is None else plan.ticks
-    row = [
-        plan.period_ns, plan.timeout_ns, sync_bytes, end, wait_ns(plan, timed), plan.every, plan.together,
-        plan.pacing == "feedback",
-    ]  # fmt: skip
-    return np.array(row, np.int64)
-
-
 def table_of(
     tables: list[npt.NDArray[np.int64]],
-    timing: npt.NDArray[np.int64],
+    timing: Timing,
     record: TickArray,
     words: Words | None,
     request: StopRequest,
@@ -172,9 +160,9 @@ def table_of(
 
 
 def _compiled() -> Callable[..., int]:
-    """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
+    """The compiled form; the call that makes it may run no tick."""
     table = np.zeros((ROWS, 2), np.int64)
-    sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: DID + 1, REQUEST: 1, NUMBER: 1}
+    sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEWS + 1, REQUEST: 1, NUMBER: 1}
     known = {row: np.zeros(size, np.int64) for row, size in sizes.items()}
     known[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
     for row, array in known.items():
@@ -212,8 +200,9 @@ def mark_often(marks: Any, count: int) -> None:
 
 
 @jit
-def sleep_until(deadline_ns: int, times: Any) -> Any:
-    """Sleep to the absolute deadline, or to a signal; return the time of waking."""
+def sleep(table: Any, deadline_ns: int) -> Any:
+    """A part of a tick, as what follows: :class:`hil.runtime.rules.Parts`."""
+    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
     woken_ns = now_ns(times)
     while woken_ns < deadline_ns:
         times[2], times[3] = deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000
@@ -221,48 +210,99 @@ def sleep_until(deadline_ns: int, times: Any) -> Any:
         woken_ns = now_ns(times)
         if failed == EINTR:
             break
+    mark(marks, SLEEP, times)
     return woken_ns
 
 
 @jit
-def since(deadline_ns: int, times: Any) -> Any:
-    """Time after the deadline, as the record holds it."""
-    return bounded(now_ns(times) - deadline_ns)
+def now(table: Any) -> Any:
+    """CLOCK_MONOTONIC [ns]."""
+    return now_ns(array_at(table, TIMES_AT, I8))
 
 
 @jit
-def read(table: Any, t: Any, deadline_ns: int, due: bool) -> Any:
-    """SYNC and feedback. Returns the stage reached: DECIDED once the law can go on."""
-    words, plan = array_at(table, WORDS, I8), array_at(table, PLAN, I8)
-    places, times = places_at(table, RECEIVE), array_at(table, TIMES_AT, I8)
-    io = array_at(places, IO, I8)
-    if len(words) > 0 and beats(words, now_ns(times)):
-        return NOT_BEGUN
-    code = exchange(places, plan[SYNC_BYTES], deadline_ns + (plan[TIMEOUT_NS] if due else 0))
-    if code == PENDING:
-        return NOT_BEGUN
+def until(_table: Any, ns: int, wait_ns: int) -> Any:
+    """In real time."""
+    return ns + wait_ns
+
+
+@jit
+def asked(table: Any, k: int) -> Any:
+    """What is asked of the supervisor in tick k."""
+    return asked_in(k, array_at(table, PLAN, I8)[END], array_at(table, REQUEST, I8)[0])
+
+
+@jit
+def begun(_table: Any, _t: Any) -> None:
+    """There is no other node."""
+
+
+@jit
+def sync(table: Any, t: Any, deadline_ns: int) -> Any:
+    """SYNC and feedback."""
+    words, places = array_at(table, WORDS, I8), places_at(table, RECEIVE)
+    if len(words) > 0 and beats(words, now(table)):
+        return False
+    return taken(table, t, sync_and_drain(places, array_at(table, PLAN, I8)[SYNC_BYTES], deadline_ns))
+
+
+@jit
+def receive(table: Any, t: Any, deadline_ns: int) -> Any:
+    """What the client must tell first is the loop's, as is a guardian that has fired."""
+    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
+    s = array_at(places, STATES, STATE)[0]
+    if s["pending"] != 0 or s["down"] != 0 or (len(words) > 0 and words[FIRED] != 0):
+        return False
+    return taken(table, t, drain(places, deadline_ns, False))
+
+
+@jit
+def taken(table: Any, t: Any, code: int) -> Any:
+    """Whether a kernel of the client's is done; else the client concludes what it has begun."""
+    words, marks = array_at(table, WORDS, I8), array_at(table, MARKS, I8)
+    mark(marks, READING, array_at(table, TIMES_AT, I8))
     if code != DONE:
-        io[EXCHANGED] = code
-        return BEGUN
+        if code != PENDING:
+            array_at(places_at(table, RECEIVE), IO, I8)[EXCHANGED] = code
+        return False
     if len(words) > 0:
         t["rx_flags"] |= guardian_flags(words)
-    return DECIDED
+    return True
+
+
+@jit
+def synced(table: Any) -> tuple[int, int]:
+    """SYNCs that the ear has heard."""
+    ear = array_at(places_at(table, RECEIVE), EAR, I8)
+    if len(ear) == 0:
+        return -1, 0
+    count, ear[SYNCED] = ear[SYNCED], 0
+    return count, ear[STAMP]
+
+
+@jit
+def law(table: Any, _t: Any) -> Any:
+    """Law, supervisor and guard."""
+    whole_at(places_at(table, LAW), array_at(table, TICK_AT, TICK))
+    mark(array_at(table, MARKS, I8), CONTROL, array_at(table, TIMES_AT, I8))
+    return True
 
 
 @jit
 def answer(table: Any, t: Any) -> Any:
-    """The command, if there is one. Returns the stage reached: SENT when the loop has nothing to send."""
-    words, places = array_at(table, WORDS, I8), places_at(table, COMMAND)
-    times, io = array_at(table, TIMES_AT, I8), array_at(places, IO, I8)
-    if t["send"] == 0:
-        return SENT
-    if len(words) > 0 and commands(words, now_ns(times), t["state"], t["counter"]):
-        return DECIDED
-    code = command(places)
-    if code != DONE:
-        io[COMMANDED] = code
-        return DECIDED
-    return SENT
+    """The command, if there is one."""
+    words, times = array_at(table, WORDS, I8), array_at(table, TIMES_AT, I8)
+    places = places_at(table, COMMAND)
+    if t["send"] != 0:
+        if len(words) > 0 and commands(words, now_ns(times), t["state"], t["counter"]):
+            return False
+        code = command(places)
+        if code != DONE:
+            array_at(places, IO, I8)[COMMANDED] = code
+            return False
+    t["sent_ns"] = since(now, table, t)
+    mark(array_at(table, MARKS, I8), SEND, times)
+    return True
 
 
 @jit
@@ -275,106 +315,19 @@ def hand_on(table: Any) -> None:
 
 
 @jit
-def run_tick(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
-    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.rules` that it reached."""
-    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
-    mark(marks, LOOP, times)
-    woken_ns = sleep_until(deadline_ns, times)
-    mark(marks, SLEEP, times)
-    late_ns = woken_ns - deadline_ns
-    plan = array_at(table, PLAN, I8)
-    if late_ns < 0 or late_ns >= plan[PERIOD_NS]:
-        return NOT_BEGUN
-    ticks = array_at(table, TICK_AT, TICK)
-    t = ticks[0]
-    request, pace = t["request"], array_at(table, PACE, I8)
-    stamp(t, k, deadline_ns, 1, late_ns)
-    begin(t, asked, log_failed)
-    stage = read(table, t, deadline_ns, is_due(pace, plan[EVERY]))
-    mark(marks, READ, times)
-    if stage < DECIDED:
-        return stage
-    return conclude(table, ticks, deadline_ns, request)
-
-
-@jit
-def conclude(table: Any, ticks: Any, deadline_ns: int, request: int) -> Any:
-    """Law, command and record of a tick whose feedback was waited for; ``request``: the last tick's."""
-    times, marks, t = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8), ticks[0]
-    t["received_ns"] = since(deadline_ns, times)
-    state = t["state"]
-    whole_at(places_at(table, LAW), ticks)
-    t["computed_ns"] = since(deadline_ns, times)
-    mark(marks, CONTROL, times)
-    stage = answer(table, t)
-    if stage < SENT:
-        return stage
-    t["sent_ns"] = since(deadline_ns, times)
-    mark(marks, SEND, times)
+def tell(table: Any, t: Any, state: int, request: int) -> Any:
+    """Frames are handed on; what there is to say is the loop's."""
     hand_on(table)
-    if is_news(t, state, request):
-        return SENT
-    count(array_at(table, PACE, I8), t)
+    return not is_news(t, state, request)
+
+
+@jit
+def store(table: Any, t: Any) -> None:
+    """The record into its ring."""
+    times = array_at(table, TIMES_AT, I8)
     push(places_at(table, TICKS_IN), 1)
-    t["recorded_ns"] = since(deadline_ns, times)
-    mark(marks, RECORD, times)
-    return RECORDED
-
-
-@jit
-def receive(table: Any, t: Any, deadline_ns: int) -> Any:
-    """For :func:`newest`. What the client must tell first is the loop's, as is a guardian that has fired."""
-    places, words = places_at(table, RECEIVE), array_at(table, WORDS, I8)
-    s = array_at(places, STATES, STATE)[0]
-    if s["pending"] != 0 or s["down"] != 0 or (len(words) > 0 and words[FIRED] != 0):
-        return False
-    code = drain(places, deadline_ns, False)
-    if code != DONE:
-        array_at(places, IO, I8)[EXCHANGED] = code
-        return False
-    if len(words) > 0:
-        t["rx_flags"] |= guardian_flags(words)
-    return True
-
-
-@jit
-def heard(table: Any, t: Any, came: int) -> None:
-    """Stamp a tick that feedback, or SYNC of the kernel's, woke."""
-    times, pace, plan = array_at(table, TIMES_AT, I8), array_at(table, PACE, I8), array_at(table, PLAN, I8)
-    ear = array_at(places_at(table, RECEIVE), EAR, I8)
-    now, jumped = now_ns(times), t["rx_flags"] & COUNTER_JUMP
-    if len(ear) > 0:
-        came, jumped, ear[SYNCED] = ear[SYNCED], 0, 0
-        now = ear[STAMP] if came > 0 else now
-    wake(t, pace, plan[PERIOD_NS], came, jumped, now)
-    t["request"] = asked_at(table, int(t["k"]))
-
-
-@jit
-def run_followed(table: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
-    """:func:`run_tick` for a tick that begins when the drive's cyclic feedback comes."""
-    times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
-    mark(marks, LOOP, times)
-    if k == 0:
-        return NOT_BEGUN
-    pace, plan, ticks = array_at(table, PACE, I8), array_at(table, PLAN, I8), array_at(table, TICK_AT, TICK)
-    t = ticks[0]
-    request = t["request"]
-    stamp(t, k, deadline_ns, 1, 0)
-    begin(t, asked, log_failed)
-    wait = plan[WAIT_NS if is_due(pace, plan[EVERY]) else PERIOD_NS]
-    came = newest(receive, table, t, pace, pace[ARRIVED] + wait)
-    mark(marks, READ, times)
-    if came < 0:
-        return BEGUN
-    heard(table, t, came)
-    return conclude(table, ticks, int(t["t_ns"]), request)
-
-
-@jit
-def asked_at(table: Any, k: int) -> Any:
-    """What is asked of the supervisor in tick k."""
-    return asked_in(k, array_at(table, PLAN, I8)[END], array_at(table, REQUEST, I8)[0])
+    t["recorded_ns"] = since(now, table, t)
+    mark(array_at(table, MARKS, I8), RECORD, times)
 
 
 @jit
@@ -383,24 +336,27 @@ def news(table: Any) -> Any:
     return array_at(table, NUMBER, I8)[0] + array_at(places_at(table, TICKS_IN), HEADER, I8)[FAILED_AT]
 
 
-@waiting
-def run_ticks(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
+@rule
+def ticks_of(io: Any, table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
     """Ticks from k on, the first at its deadline [ns], until one is left to the loop or Python has its turn.
 
     Returns the stage of :mod:`hil.runtime.rules` that the last one reached; the pace says how many ran.
     """
-    plan, pace = array_at(table, PLAN, I8), array_at(table, PACE, I8)
-    before = news(table)
-    while True:
-        if plan[FOLLOWS] != 0:
-            stage = run_followed(table, k, deadline_ns, asked_at(table, k), log_failed)
-        else:
-            stage = run_tick(table, k, deadline_ns, asked_at(table, k), log_failed)
+    plan, pace, marks = array_at(table, PLAN, I8), array_at(table, PACE, I8), array_at(table, MARKS, I8)
+    before, t = news(table), array_at(table, TICK_AT, TICK)[0]
+    while pace[RAN] < plan[TOGETHER]:
+        mark(marks, LOOP, array_at(table, TIMES_AT, I8))
+        stage = run_tick(io, table, t, pace, plan, NOT_BEGUN, k, deadline_ns, log_failed)
         if stage != RECORDED:
             return stage
-        t = array_at(table, TICK_AT, TICK)[0]
-        k, deadline_ns = int(t["k"]), int(t["t_ns"])
-        pace[RAN], pace[LOST], pace[NEXT] = pace[RAN] + 1, pace[LOST] + t["skipped"], k + 1
-        if pace[RAN] >= plan[TOGETHER] or k % STEER_EVERY == 0 or news(table) != before:
-            return RECORDED
-        k, deadline_ns = k + 1, deadline_ns + plan[PERIOD_NS]
+        k, deadline_ns = int(t["k"]) + 1, int(t["t_ns"]) + plan[PERIOD_NS]
+        pace[RAN], pace[LOST], pace[NEXT] = pace[RAN] + 1, pace[LOST] + t["skipped"], k
+        if t["k"] % STEER_EVERY == 0 or news(table) != before:
+            break
+    return RECORDED
+
+
+@waiting
+def run_ticks(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
+    """:func:`ticks_of` one drive."""
+    return ticks_of(PARTS, table, k, deadline_ns, log_failed)

@@ -8,6 +8,7 @@ behind it.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
@@ -28,76 +29,57 @@ from drivers.posix import (
     command,
     drain,
     exchange,
-    now_ns,
 )
 from drivers.wire import STATE
 from hil.control.law import LAW_PARAMS
 from hil.log.push import NOWHERE, push
 from hil.log.recorder import Recorder
+from hil.runtime import fused
 from hil.runtime.fused import (
     COMMAND,
     CONTROL,
     FRAMES_IN,
     I8,
     LAW,
-    LOOP,
     MARKS,
     NUMBER,
     PACE,
-    PERIOD_NS,
     PLAN,
-    PLANNED,
-    READ,
+    READING,
     RECEIVE,
     RECORD,
     REQUEST,
     ROWS,
     SEND,
-    SLEEP,
-    SYNC_BYTES,
     TICK_AT,
     TICKS_IN,
-    TIMEOUT_NS,
     TIMES_AT,
-    TOGETHER,
     WORDS,
     Marks,
-    asked_at,
     mark,
-    news,
-    since,
-    sleep_until,
     table_of,
-    timing_of,
+    ticks_of,
 )
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, beats, guardian_flags
-from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled
+from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, timing_of
 from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
-from hil.runtime.rules import (
-    BEGUN,
-    DECIDED,
-    DID,
-    NEXT,
-    NOT_BEGUN,
-    RAN,
-    RECORDED,
-    SENT,
-    Pace,
-    begin,
-    stamp,
-)
+from hil.runtime.rules import DID, NEWS, PLANNED, SYNC_BYTES, Pace, begin, since, stamp
 from hil.runtime.trouble import TROUBLE
 from hil.signals import TICK
 from hil.tick.kernel import PLACED, whole_at
-from hil.tick.pair import ask, leads, tell
+from hil.tick.pair import ask, leads
+from hil.tick.pair import tell as tell_load
 
-NODE_ROWS: Final = ROWS + 1
-KEPT: Final = ROWS
-"""Behind a node's table: the places of its controller's states, then of what is kept of them."""
+KEPT, NODES, NODE_ROWS = ROWS, ROWS + 1, ROWS + 2
+"""Behind a node's table: the places of its controller's states, then of what is kept of them; behind the
+first's that of the nodes' tables, too."""
 ADDRESS, LENGTH = 0, 1
 LAW_AT: Final = PLACED.index(LAW_PARAMS)
 QUIET, STOPPED, ENDS = ALONE
-CALM, NEW, OTHERS = range(3)
+PARTS: Final = sys.modules[__name__]
+"""As :data:`hil.runtime.fused.PARTS`; these are as there, of the first node."""
+sleep, now, until, asked = fused.sleep, fused.now, fused.until, fused.asked
+receive, synced = fused.receive, fused.synced
 U1: Final = np.dtype(np.uint8)
 _word: Any = numba.types.uintp
 _memcpy: Any = numba.types.ExternalFunction("memcpy", _word(_word, _word, _word))
@@ -120,28 +102,29 @@ def whole_nodes(
     for place, (axis, port) in enumerate(zip(axes, ports, strict=True)):
         if port is None or port.exchange is None:
             return none_compiled
-        own = [port.exchange if place == 0 else port.follow, port.command, axis.machine.places()]
+        own = [port.exchange if place == 0 else port.receive, port.command, axis.machine.places()]
         own += recorder.places(port.log, place)
-        timing = timing_of(plan, port.sync_bytes, False)
+        timing = timing_of(plan, False, port.sync_bytes)
         table, held = table_of(own, timing, axis.ticks, words, request, pace, number, marks)
         kept = np.array([place_of(array, U1) for array in axis.states()])
-        tables.append(np.concatenate([table, [place_of(kept.reshape(-1), I8)]]))
+        tables.append(np.concatenate([table, [place_of(kept.reshape(-1), I8), (0, 0)]]))
         alive += [held, kept]
     nodes = np.array([place_of(table.reshape(-1), I8) for table in tables])
-    call = partial(_compiled(), nodes)
-    call.__dict__["alive"] = (alive, tables)  # the places are of them
+    tables[0][NODES] = place_of(nodes.reshape(-1), I8)
+    call = partial(_compiled(), tables[0])
+    call.__dict__["alive"] = (alive, tables, nodes)  # the places are of them
     return call
 
 
 def _compiled() -> Any:
-    """The compiled form; the call that makes it is for a first tick that is late, which it leaves alone."""
+    """The compiled form; the call that makes it may run no tick."""
     table = np.zeros((NODE_ROWS, 2), np.int64)
-    known = {TIMES_AT: 4, PLAN: PLANNED, PACE: DID + 1, REQUEST: 1, NUMBER: 1}
+    known = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEWS + 1, REQUEST: 1, NUMBER: 1}
     arrays = {row: np.zeros(size, np.int64) for row, size in known.items()}
     arrays[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
     for row, array in arrays.items():
         table[row] = place_of(array, I8)
-    return entry(run_together, np.array([place_of(table.reshape(-1), I8)]), 0, 0, False)
+    return entry(run_together, table, 0, 0, False)
 
 
 def load() -> None:
@@ -178,6 +161,17 @@ def hand_on(table: Any) -> None:
 
 
 @jit
+def begun(table: Any, t: Any) -> None:
+    """Of :class:`hil.runtime.rules.Parts`, as are :func:`sync`, :func:`law` and the last four."""
+    nodes, pace = places_at(table, NODES), array_at(table, PACE, I8)
+    pace[DID] = 0
+    for i in range(1, len(nodes)):
+        one = tick_of(places_at(nodes, i))
+        stamp(one, t["k"], t["t_ns"], t["gap"], t["lateness_ns"])
+        begin(one, t["request"], t["log_failed"])
+
+
+@jit
 def waits(nodes: Any) -> bool:
     """Whether a client has something to tell first: flags, a bus that was down, a frame to be judged."""
     for i in range(len(nodes)):
@@ -203,37 +197,31 @@ def take_late(table: Any) -> Any:
 
 
 @jit
-def read(nodes: Any, deadline_ns: int) -> Any:
-    """SYNC and the feedback of all. Returns the stage reached: DECIDED once the laws can go on."""
-    first = places_at(nodes, 0)
-    words, pace, plan = array_at(first, WORDS, I8), array_at(first, PACE, I8), array_at(first, PLAN, I8)
-    if waits(nodes):
-        return NOT_BEGUN
-    if len(words) > 0 and beats(words, now_of(first)):
-        return NOT_BEGUN
-    pace[DID] = 0
+def sync(table: Any, _t: Any, until_ns: int) -> Any:
+    """SYNC and the feedback of all."""
+    nodes, words, pace = places_at(table, NODES), array_at(table, WORDS, I8), array_at(table, PACE, I8)
+    if waits(nodes) or (len(words) > 0 and beats(words, now(table))):
+        return False
     for i in range(1, len(nodes)):
         if take_late(places_at(nodes, i)) != DONE:
-            return BEGUN
+            return False
         pace[DID] += 1
-    until_ns = deadline_ns + plan[TIMEOUT_NS]
+    size = array_at(table, PLAN, I8)[SYNC_BYTES]
     for i in range(len(nodes)):
-        table = places_at(nodes, i)
-        places = places_at(table, RECEIVE)
-        code = exchange(places, plan[SYNC_BYTES], until_ns) if i == 0 else drain(places, until_ns, False)
+        one = places_at(nodes, i)
+        places = places_at(one, RECEIVE)
+        code = exchange(places, size, until_ns) if i == 0 else drain(places, until_ns, False)
         if code != DONE:
             if code != PENDING or i > 0:
-                io_of(table, RECEIVE)[EXCHANGED] = code
-            return BEGUN
-        hand_on(table)
+                io_of(one, RECEIVE)[EXCHANGED] = code
+            return False
+        hand_on(one)
         pace[DID] += 1
-    return DECIDED
-
-
-@jit
-def now_of(table: Any) -> Any:
-    """CLOCK_MONOTONIC [ns]."""
-    return now_ns(array_at(table, TIMES_AT, I8))
+    if len(words) > 0:
+        for i in range(len(nodes)):
+            tick_of(places_at(nodes, i))["rx_flags"] |= guardian_flags(words)
+    mark(array_at(table, MARKS, I8), READING, array_at(table, TIMES_AT, I8))
+    return True
 
 
 @jit
@@ -267,137 +255,85 @@ def lead_of(nodes: Any) -> Any:
 
 
 @jit
-def decide(nodes: Any) -> Any:
-    """Each node's controller: OTHERS when those must stop with one, NEW when there is something to log."""
-    found, left, going = CALM, False, False
+def law(table: Any, t: Any) -> Any:
+    """Each node's controller; not all that is to be done where the others must stop with one."""
+    nodes, pace = places_at(table, NODES), array_at(table, PACE, I8)
+    left, going, pace[NEWS] = False, False, 0
+    for i in range(1, len(nodes)):
+        tick_of(places_at(nodes, i))["received_ns"] = t["received_ns"]
     lead = lead_of(nodes)
     first, load = max(lead, 0), 1 - lead
     for n in range(len(nodes)):
         i = (first + n) % len(nodes)
         if lead >= 0 and n == 0:
-            tell(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
+            tell_load(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
         elif lead >= 0:
             ask(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
-        table = places_at(nodes, i)
-        ticks = array_at(table, TICK_AT, TICK)
+        one = places_at(nodes, i)
+        ticks = array_at(one, TICK_AT, TICK)
         state, before = ticks[0]["state"], ticks[0]["reason"]
-        keep(table)
-        whole_at(places_at(table, LAW), ticks)
+        keep(one)
+        whole_at(places_at(one, LAW), ticks)
         reason = ticks[0]["reason"]
         left |= reason not in (QUIET, STOPPED, ENDS)
         going |= reason == QUIET
         if reason != before or ticks[0]["state"] != state or ticks[0]["rx_flags"] & TROUBLE != 0:
-            found = NEW
-    return OTHERS if left and going else found
+            pace[NEWS] = 1
+    pace[DID] = LEFT if left and going else 0
+    mark(array_at(table, MARKS, I8), CONTROL, array_at(table, TIMES_AT, I8))
+    return pace[DID] != LEFT
 
 
 @jit
-def answer(nodes: Any, deadline_ns: int) -> Any:
-    """The commands, in the nodes' order. Returns the stage reached: SENT when the loop has none to send."""
-    first = places_at(nodes, 0)
-    words, pace, times = array_at(first, WORDS, I8), array_at(first, PACE, I8), array_at(first, TIMES_AT, I8)
-    if len(words) > 0:
-        words[BEAT_NS] = now_of(first)
-        armed = 0
-        for i in range(len(nodes)):
-            t = tick_of(places_at(nodes, i))
-            words[COUNTERS + i] = t["counter"]
-            armed |= int(t["state"] != DISARMED)
-        words[ARMED] = armed
-    pace[DID] = 0
+def answer(table: Any, t: Any) -> Any:
+    """The commands, in the nodes' order."""
+    nodes, words, pace = places_at(table, NODES), array_at(table, WORDS, I8), array_at(table, PACE, I8)
+    armed = 0
     for i in range(len(nodes)):
-        table = places_at(nodes, i)
-        t = tick_of(table)
-        if t["send"] != 0:
+        one = tick_of(places_at(nodes, i))
+        one["computed_ns"] = t["computed_ns"]
+        armed |= int(one["state"] != DISARMED)
+        if len(words) > 0:
+            words[COUNTERS + i] = one["counter"]
+    if len(words) > 0:
+        words[BEAT_NS], words[ARMED] = now(table), armed
+    for i in range(len(nodes)):
+        node = places_at(nodes, i)
+        one = tick_of(node)
+        if one["send"] != 0:
             if len(words) > 0 and words[FIRED] != 0:
-                return DECIDED
-            code = command(places_at(table, COMMAND))
+                return False
+            code = command(places_at(node, COMMAND))
             if code != DONE:
-                io_of(table, COMMAND)[COMMANDED] = code
-                return DECIDED
-            hand_on(table)
-        t["sent_ns"] = since(deadline_ns, times)
+                io_of(node, COMMAND)[COMMANDED] = code
+                return False
+            hand_on(node)
+        one["sent_ns"] = since(now, table, t)
         pace[DID] += 1
-    return SENT
+    mark(array_at(table, MARKS, I8), SEND, array_at(table, TIMES_AT, I8))
+    return True
 
 
 @jit
-def run_tick(nodes: Any, k: int, deadline_ns: int, asked: int, log_failed: bool) -> Any:
-    """A tick at its deadline [ns]; returns the stage of :mod:`hil.runtime.rules` that it reached."""
-    first = places_at(nodes, 0)
-    times, marks = array_at(first, TIMES_AT, I8), array_at(first, MARKS, I8)
-    mark(marks, LOOP, times)
-    woken_ns = sleep_until(deadline_ns, times)
-    mark(marks, SLEEP, times)
-    late_ns = woken_ns - deadline_ns
-    if late_ns < 0 or late_ns >= array_at(first, PLAN, I8)[PERIOD_NS]:
-        return NOT_BEGUN
-    request = tick_of(first)["request"]
-    for i in range(len(nodes)):
-        t = tick_of(places_at(nodes, i))
-        stamp(t, k, deadline_ns, 1, late_ns)
-        begin(t, asked, log_failed)
-    stage = read(nodes, deadline_ns)
-    mark(marks, READ, times)
-    return conclude(nodes, deadline_ns, request) if stage == DECIDED else stage
+def tell(table: Any, t: Any, _state: int, request: int) -> Any:
+    """What there is to say is the loop's."""
+    return array_at(table, PACE, I8)[NEWS] == 0 and t["request"] == request
 
 
 @jit
-def conclude(nodes: Any, deadline_ns: int, request: int) -> Any:
-    """Laws, commands and records of a tick whose feedback was waited for; ``request``: the last tick's."""
-    first = places_at(nodes, 0)
-    times, marks, words = (
-        array_at(first, TIMES_AT, I8),
-        array_at(first, MARKS, I8),
-        array_at(first, WORDS, I8),
-    )
-    received_ns, flags = since(deadline_ns, times), 0
-    if len(words) > 0:
-        flags = guardian_flags(words)
-    for i in range(len(nodes)):
-        t = tick_of(places_at(nodes, i))
-        t["rx_flags"] |= np.uint32(flags)
-        t["received_ns"] = received_ns
-    found = decide(nodes)
-    if found == OTHERS:
-        array_at(first, PACE, I8)[DID] = LEFT
-        return DECIDED
-    computed_ns = since(deadline_ns, times)
-    for i in range(len(nodes)):
-        tick_of(places_at(nodes, i))["computed_ns"] = computed_ns
-    mark(marks, CONTROL, times)
-    stage = answer(nodes, deadline_ns)
-    mark(marks, SEND, times)
-    if stage < SENT or found == NEW or tick_of(first)["request"] != request:
-        return stage
-    record(nodes, deadline_ns)
-    mark(marks, RECORD, times)
-    return RECORDED
-
-
-@jit
-def record(nodes: Any, deadline_ns: int) -> None:
-    """The ticks into their rings; when the first was stored stands in all."""
-    first = places_at(nodes, 0)
-    push(places_at(first, TICKS_IN), 1)
-    stored_ns = since(deadline_ns, array_at(first, TIMES_AT, I8))
+def store(table: Any, t: Any) -> None:
+    """The records into their rings; when the first was stored stands in all."""
+    nodes = places_at(table, NODES)
+    push(places_at(table, TICKS_IN), 1)
+    stored_ns = since(now, table, t)
     for i in range(1, len(nodes)):
         push(places_at(places_at(nodes, i), TICKS_IN), 1)
     for i in range(len(nodes)):
         tick_of(places_at(nodes, i))["recorded_ns"] = stored_ns
+    mark(array_at(table, MARKS, I8), RECORD, array_at(table, TIMES_AT, I8))
 
 
 @waiting
-def run_together(nodes: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
-    """:func:`hil.runtime.fused.run_ticks` of several nodes."""
-    first = places_at(nodes, 0)
-    plan, pace = array_at(first, PLAN, I8), array_at(first, PACE, I8)
-    before = news(first)
-    while True:
-        stage = run_tick(nodes, k, deadline_ns, asked_at(first, k), log_failed)
-        if stage != RECORDED:
-            return stage
-        pace[RAN], pace[NEXT] = pace[RAN] + 1, k + 1
-        if pace[RAN] >= plan[TOGETHER] or news(first) != before:
-            return RECORDED
-        k, deadline_ns = k + 1, deadline_ns + plan[PERIOD_NS]
+def run_together(table: Any, k: int, deadline_ns: int, log_failed: bool) -> Any:
+    """:func:`hil.runtime.fused.ticks_of` several nodes; ``table``: the first's."""
+    return ticks_of(PARTS, table, k, deadline_ns, log_failed)

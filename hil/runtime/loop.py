@@ -15,32 +15,24 @@ import numpy as np
 
 from hil.ports import Clock, Drive, Inbox, Recorder, Timed
 from hil.runtime.rules import (
-    ARRIVED,
-    BEGUN,
-    COUNTER_JUMP,
-    DECIDED,
-    FRESH,
+    END,
     LOST,
-    MAX_NS,
     NEVER,
     NEXT,
     NOT_BEGUN,
+    PACINGS,
     RAN,
     RECORDED,
     STEER_EVERY,
     Fields,
     Pace,
     Pacing,
+    Timing,
     asked_in,
-    begin,
-    bounded,
-    count,
-    is_due,
     is_news,
     new_pace,
-    newest,
-    stamp,
-    wake,
+    run_tick,
+    since,
 )
 from hil.runtime.trouble import TROUBLE, Trouble
 from hil.signals import DriveState, Reason, Request, RxFlag, TickArray, ticks_from
@@ -55,14 +47,6 @@ ENDED = (int(DriveState.SWITCH_ON_DISABLED), int(DriveState.FAULT))
 RAMP_DOWN = int(Request.RAMP_DOWN)
 BUS_DOWN, SEND_FAILED = int(RxFlag.BUS_DOWN), int(RxFlag.SEND_FAILED)
 RAMP_EVENT = "ramp-down", "a stop was asked: the speed reference ramps to 0"
-
-
-def wait_ns(plan: Plan, timed: bool) -> int:
-    """How long after the last feedback, or the last SYNC of the kernel's, the next is waited for.
-
-    Where none is due a tick begins when it would have been due: :func:`is_due`.
-    """
-    return plan.period_ns + plan.timeout_ns if timed else plan.period_ns * 3 // 2
 
 
 class StopRequest:
@@ -113,6 +97,15 @@ class Plan:
     together: int = 1
 
 
+def timing_of(plan: Plan, timed: bool, sync_bytes: int = 0) -> Timing:
+    """The plan, as the rules read it; ``timed``: the kernel sends SYNC, of that size."""
+    end = NEVER if plan.ticks is None else plan.ticks
+    wait_ns = plan.period_ns + plan.timeout_ns if timed else plan.period_ns * 3 // 2
+    paced = PACINGS.index(plan.pacing)
+    row = plan.period_ns, plan.timeout_ns, end, wait_ns, plan.every, plan.together, paced, sync_bytes
+    return np.array(row, np.int64)
+
+
 @dataclass(slots=True)
 class Outcome:
     """What a run was: ticks, skipped periods, why it ended."""
@@ -151,7 +144,7 @@ class Course:
         self._t, self._ticks, self._recorder, self._of = t, ticks, recorder, of
         self._trouble = Trouble(self._say)
         self._state, self._request = int(DriveState.SWITCH_ON_DISABLED), int(Request.ARM)
-        self.outcome, self.ended = Outcome(), False
+        self.outcome, self._ended = Outcome(), False
 
     def _say(self, t_ns: int, k: int, kind: str, text: str) -> None:
         self._recorder.event(t_ns, k, kind, self._of + text)
@@ -170,14 +163,15 @@ class Course:
             self._say(t_ns, k, *RAMP_EVENT)
         self._state, self._request = state, request
 
-    def conclude(self) -> None:
-        """Find out whether the run has ended, with the tick as it stands."""
+    def conclude(self) -> bool:
+        """Whether the run has ended, with the tick as it stands: no state in which it drives is left."""
         t, outcome = self._t, self.outcome
         if t["reason"]:
             if outcome.stop is None:
                 outcome.stop = ticks_from(self._ticks.tobytes())  # .copy() goes field by field
             outcome.state, outcome.reason = t["state"], t["reason"]
-            self.ended = t["state"] in ENDED
+            self._ended = t["state"] in ENDED
+        return self._ended
 
 
 class Loop:
@@ -205,11 +199,10 @@ class Loop:
         self._timed = timed
         self._drive, self._clock, self._recorder = drive, clock, recorder
         self._step, self._ticks, self._plan, self._request = step, ticks, plan, request
-        self._end = NEVER if plan.ticks is None else plan.ticks
-        self._sends_sync = plan.pacing == "sync"
+        self._timing: Any = timing_of(plan, timed is not None).data
         self._t = Fields(ticks)
-        self._course = Course(self._t, ticks, recorder)
-        self._outcome = self._course.outcome
+        self._courses = [Course(self._t, ticks, recorder)]
+        self._outcome = self._courses[0].outcome
         pace = new_pace()
         self._pace: Any = pace.data
         self._start_ns = 0
@@ -218,7 +211,6 @@ class Loop:
         self._tick: Any = ticks[0]
         drive.prepare(self._tick)
         self._whole = whole(pace)
-        self._ended = False  # True once the supervisor has left every state in which it drives
 
     def run(self) -> Outcome:
         """Run until the supervisor has ended the run. The drive is stopped on every way out."""
@@ -231,34 +223,33 @@ class Loop:
         return self._outcome
 
     def _run(self) -> None:
-        period_ns, tick, whole, pace = self._plan.period_ns, self._tick, self._whole, self._pace
+        period_ns, whole, pace, plan = self._plan.period_ns, self._whole, self._pace, self._timing
         compiled, outcome, t = whole is not none_compiled, self._outcome, self._t
         start_ns = self._start_ns = self._clock.now_ns()
         if self._timed is not None:
             self._timed.start()
-        k = 0
-        while True:
-            stage = NOT_BEGUN
+        k, stage, ended = 0, NOT_BEGUN, False
+        while not ended:
             if compiled:
-                self._asked(k)  # a set-point that waits, and what has to be polled
+                self.asked(k)  # a set-point that waits, and what has to be polled
                 pace[RAN], pace[LOST], pace[NEXT] = 0, 0, k
                 stage = whole(k, start_ns + k * period_ns, self._recorder.failed)
                 outcome.ticks += pace[RAN]
                 outcome.skipped += pace[LOST]
                 k = pace[NEXT]
             if stage != RECORDED:
-                self._rest(stage, tick, k, start_ns + k * period_ns)
+                failed = self._recorder.failed
+                run_tick(type(self), self, t, pace, plan, stage, k, start_ns + k * period_ns, failed)
+                ended = all([*map(Course.conclude, self._courses)])
                 outcome.ticks += 1
                 outcome.skipped += t["skipped"]
                 k = t["k"] + 1
-            if self._ended:
-                return
-            if self._timed is not None and not (k - 1) % STEER_EVERY:
+            if self._timed is not None and not (ended or (k - 1) % STEER_EVERY):
                 self._timed.steer(k - 1, start_ns + (k - 1) * period_ns)
 
-    def _asked(self, k: int) -> int:
+    def asked(self, k: int) -> int:
         """What is asked of the supervisor, once a set-point that waits is taken."""
-        asked = asked_in(k, self._end, self._request.value)
+        asked = asked_in(k, self._timing[END], self._request.value)
         if self._number[0] != self._taken:
             self._take(k, asked)
         return asked
@@ -274,111 +265,60 @@ class Loop:
         """Of each node's supervisor."""
         return (self._t["state"],)
 
-    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> None:
-        """What is left of a tick that got to ``stage``; one that has not begun is tick k."""
-        if stage == NOT_BEGUN:
-            self._on_time(tick, k, deadline_ns)
-        elif stage == BEGUN:
-            self._begun(tick)
-        else:
-            if stage == DECIDED:
-                self._answer(tick)
-            self._note()
+    def sleep(self, deadline_ns: int) -> int:
+        """Wait by this clock. A part of a tick, as what follows: :class:`hil.runtime.rules.Parts`."""
+        return self._clock.sleep_until(deadline_ns)
 
-    def _on_time(self, tick: Any, k: int, deadline_ns: int) -> None:
-        """Wait for the tick's time and run it; whole periods late it is the one whose time it is then."""
-        clock, period_ns, skipped = self._clock, self._plan.period_ns, 0
-        if self._plan.pacing == "feedback":
-            now_ns = clock.now_ns()
-        else:
-            now_ns = clock.sleep_until(deadline_ns)
-            skipped = (now_ns - deadline_ns) // period_ns if k else 0
-        self._one(tick, k + skipped, deadline_ns + skipped * period_ns, 1 + skipped, now_ns)
+    def now(self) -> int:
+        """Time of this clock."""
+        return self._clock.now_ns()
 
-    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
-        """Read, judge, compute, write, record."""
-        t = self._t
-        stamp(t, k, deadline_ns, gap, now_ns - deadline_ns)
-        begin(t, self._asked(k), self._recorder.failed)
-        self._begun(tick)
+    def until(self, ns: int, wait: int) -> int:
+        """The deadline by this clock."""
+        return self._clock.receive_deadline(ns, wait)
 
-    def _begun(self, tick: Any) -> None:
-        """A tick that is stamped, of which a compiled one may have read a part."""
-        now, t, timer = self._clock.now_ns, self._t, self._plan.pacing == "timer"
-        if self._sends_sync:
-            self._exchange(tick)
-        elif timer:
-            self._drive.receive(tick, 0)
-        else:
-            self._newest_feedback()
-        t["received_ns"] = bounded(now() - t["t_ns"])
-        if timer:
-            self._note_age()
-        self._step(self._ticks)
-        t["computed_ns"] = bounded(now() - t["t_ns"])
-        self._answer(tick)
-        self._note()
+    def begun(self, t: Fields) -> None:
+        """There is no other node."""
 
-    def _answer(self, tick: Any) -> None:
-        """Send the command where there is one."""
-        t = self._t
-        if t["send"]:
-            self._send(tick)
-        t["sent_ns"] = bounded(self._clock.now_ns() - t["t_ns"])
+    def sync(self, t: Fields, deadline_ns: int) -> bool:
+        """SYNC out and feedback in."""
+        try:
+            self._drive.exchange(self._tick, deadline_ns)
+        except OSError as error:
+            t["rx_flags"] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
+        return True
 
-    def _note(self) -> None:
-        """Log what is new, then the record; find out whether the run has ended."""
-        t, course = self._t, self._course
-        course.tell()
-        count(self._pace, t)
-        self._recorder.tick(self._ticks)
-        t["recorded_ns"] = bounded(self._clock.now_ns() - t["t_ns"])
-        course.conclude()
-        self._ended = course.ended
-
-    def _receive(self, _t: Fields, deadline_ns: int) -> bool:
-        """All that comes until then, or until feedback."""
+    def receive(self, t: Fields, deadline_ns: int) -> bool:
+        """Feedback alone."""
         self._drive.receive(self._tick, deadline_ns)
         return True
 
-    def _newest_feedback(self) -> None:
-        """Wait for cyclic feedback; of several that queued up the newest counts: :func:`wake`.
+    def synced(self) -> tuple[int, int]:
+        """SYNCs of the kernel's."""
+        return (-1, 0) if self._timed is None else self._timed.taken()
 
-        Where the kernel sends SYNC, each SYNC is one period, and its stamp is when it came.
-        """
-        t, pace, plan = self._t, self._pace, self._plan
-        if not t["k"]:
-            pace[ARRIVED] = self._clock.now_ns()
-        wait = wait_ns(plan, self._timed is not None) if is_due(pace, plan.every) else plan.period_ns
-        until_ns = self._clock.receive_deadline(pace[ARRIVED], wait)
-        heard = newest(Loop._receive, self, t, pace, until_ns)
-        now_ns, jumped = self._clock.now_ns(), t["rx_flags"] & COUNTER_JUMP
-        if self._timed is not None:
-            heard, stamp_ns = self._timed.taken()
-            now_ns, jumped = stamp_ns if heard else now_ns, 0
-        wake(t, pace, plan.period_ns, heard, jumped, now_ns)
-        t["request"] = self._asked(t["k"])
+    def law(self, t: Fields) -> bool:
+        """Law, supervisor and guard."""
+        self._step(self._ticks)
+        return True
 
-    def _note_age(self) -> None:
-        """Paced by the timer: the newest feedback may be of an earlier tick, and ``received_ns`` says so."""
-        t = self._t
-        if t["rx_flags"] & FRESH:
-            self._pace[ARRIVED] = t["t_ns"] + t["received_ns"]
-        t["received_ns"] = max(self._pace[ARRIVED] - t["t_ns"], -MAX_NS)
-
-    def _exchange(self, tick: Any) -> None:
-        """SYNC out and feedback in; where none is due, what is there."""
-        t = self._t
-        wait = self._plan.timeout_ns if is_due(self._pace, self._plan.every) else 0
-        try:
-            self._drive.exchange(tick, self._clock.receive_deadline(t["t_ns"], wait))
-        except OSError as error:
-            t["rx_flags"] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
-
-    def _send(self, tick: Any) -> None:
+    def answer(self, t: Fields) -> bool:
         """Send the command; a bus that does not take it is seen by the supervisor in the next tick."""
         try:
-            self._drive.send(tick)
+            if t["send"]:
+                self._drive.send(self._tick)
         except OSError as error:
-            t = self._t
             self._recorder.event(t["t_ns"], t["k"], "send-failed", str(error))
+        t["sent_ns"] = since(Loop.now, self, t)
+        return True
+
+    def tell(self, t: Fields, state: int, request: int) -> bool:
+        """Log what is new."""
+        for course in self._courses:
+            course.tell()
+        return True
+
+    def store(self, t: Fields) -> None:
+        """The record into its ring."""
+        self._recorder.tick(self._ticks)
+        t["recorded_ns"] = since(Loop.now, self, t)

@@ -31,7 +31,7 @@ from hil.runtime.loop import (
     Whole,
     no_whole,
 )
-from hil.runtime.rules import DECIDED, DID, Fields, Pace, begin, bounded, stamp
+from hil.runtime.rules import DID, Fields, Pace, begin, since, stamp
 from hil.signals import Reason, Request, TickArray
 from hil.tick.pair import ask, leads, tell
 
@@ -198,33 +198,41 @@ class NodesLoop(Loop):
         super().__init__(
             self._together, clock, recorder, first.step, first.ticks, plan, request, whole, inbox
         )
-        self._others = [Course(axis.t, axis.ticks, recorder, f"{axis.name}: ") for axis in self._more]
-        for axis, course in zip(axes, (self._course, *self._others), strict=True):
+        self._courses += [Course(axis.t, axis.ticks, recorder, f"{axis.name}: ") for axis in self._more]
+        for axis, course in zip(axes, self._courses, strict=True):
             axis.outcome = course.outcome
 
-    def _one(self, tick: Any, k: int, deadline_ns: int, gap: int, now_ns: int) -> None:
-        """A tick of all nodes, each of which has feedback in every tick."""
-        asked, self._pace[DID] = self._asked(k), 0
-        for axis in self._axes:
-            stamp(axis.t, k, deadline_ns, gap, now_ns - deadline_ns)
-            begin(axis.t, asked, self._recorder.failed)
-        self._begun(tick)
+    def begun(self, t: Fields) -> None:
+        """All ticks are as the first."""
+        self._pace[DID] = 0
+        for axis in self._more:
+            stamp(axis.t, t["k"], t["t_ns"], t["gap"], t["lateness_ns"])
+            begin(axis.t, t["request"], t["log_failed"])
 
-    def _begun(self, tick: Any) -> None:
-        """Ticks that are stamped, of which a compiled one may have read a part."""
-        words = self._words
+    def sync(self, t: Fields, deadline_ns: int) -> bool:
+        """SYNC out and feedback in; a SYNC that is not out is told to all, and what the guardian did."""
+        words, flags = self._words, 0
         if words is not None:
             words[BEAT_NS] = self._clock.now_ns()
-        self._exchange(tick)
-        guarded = 0 if words is None else guardian_flags(words)
-        received_ns = bounded(self._clock.now_ns() - self._t["t_ns"])
+        try:
+            self._together.exchange(self._tick, deadline_ns, self._pace[DID])
+        except OSError as error:
+            flags = SEND_FAILED if error.errno in FULL else BUS_DOWN
+        flags |= 0 if words is None else guardian_flags(words)
         for axis in self._axes:
-            axis.t["rx_flags"] |= guarded
-            axis.t["received_ns"] = received_ns
-        self._pace[DID] = LEFT if self._decided() else 0
-        self._computed()
-        self._answer(tick)
-        self._note()
+            axis.t["rx_flags"] |= flags
+        self._pace[DID] = 0
+        return True
+
+    def law(self, t: Fields) -> bool:
+        """Each node's controller; once one has left by a fault or a quick stop, all stop in this tick."""
+        for axis in self._more:
+            axis.t["received_ns"] = t["received_ns"]
+        if self._pace[DID] == LEFT or self._decided():
+            for axis in self._axes:
+                axis.stop_too()
+        self._pace[DID] = 0
+        return True
 
     def _decided(self) -> bool:
         """Each node's controller, one that commands the other first; True when all must stop with one."""
@@ -237,38 +245,15 @@ class NodesLoop(Loop):
         ask(lead.ticks, load.ticks, load.machine.law)
         return load.decide() or leaves
 
-    def _computed(self) -> None:
-        """Once one has left by a fault or a quick stop, all stop in this tick; then the laws have run."""
-        if self._pace[DID] == LEFT:
-            for axis in self._axes:
-                axis.stop_too()
-            self._pace[DID] = 0
-        computed_ns = bounded(self._clock.now_ns() - self._t["t_ns"])
-        for axis in self._axes:
-            axis.t["computed_ns"] = computed_ns
-
-    def _rest(self, stage: int, tick: Any, k: int, deadline_ns: int) -> None:
-        """What is left of a tick, of which several nodes' may have stopped."""
-        if stage == DECIDED and self._pace[DID] == LEFT:
-            self._computed()
-        super()._rest(stage, tick, k, deadline_ns)
-
     def _states(self) -> tuple[int, ...]:
         """Of each node's supervisor."""
         return tuple(axis.t["state"] for axis in self._axes)
 
-    def _exchange(self, tick: Any) -> None:
-        """SYNC out and feedback in; a SYNC that is not out is told to all."""
-        try:
-            until_ns = self._clock.receive_deadline(self._t["t_ns"], self._plan.timeout_ns)
-            self._together.exchange(tick, until_ns, self._pace[DID])
-        except OSError as error:
-            for axis in self._axes:
-                axis.t["rx_flags"] |= SEND_FAILED if error.errno in FULL else BUS_DOWN
-
-    def _answer(self, tick: Any) -> None:
+    def answer(self, t: Fields) -> bool:
         """The commands, in the configuration's order, unless the guardian has stopped the drives."""
         words, axes = self._words, self._axes
+        for axis in self._more:
+            axis.t["computed_ns"] = t["computed_ns"]
         if words is not None:
             words[BEAT_NS] = self._clock.now_ns()
             for place, axis in enumerate(axes, COUNTERS):
@@ -277,7 +262,8 @@ class NodesLoop(Loop):
         for axis in axes[self._pace[DID] :]:
             if axis.t["send"]:
                 self._command(axis)
-            axis.t["sent_ns"] = bounded(self._clock.now_ns() - axis.t["t_ns"])
+            axis.t["sent_ns"] = since(Loop.now, self, t)
+        return True
 
     def _command(self, axis: Axis) -> None:
         """Send one node's command; a bus that does not take it is seen in the next tick."""
@@ -291,13 +277,9 @@ class NodesLoop(Loop):
             why = str(error)
         self._recorder.event(t["t_ns"], t["k"], "send-failed", f"{axis.name}: {why}")
 
-    def _note(self) -> None:
-        """Log what is new of each node, then the records."""
-        super()._note()
-        for course in self._others:
-            course.tell()
+    def store(self, t: Fields) -> None:
+        """The records; when the first was stored stands in all."""
+        super().store(t)
         self._rings.more_ticks()
-        for axis, course in zip(self._more, self._others, strict=True):
-            axis.t["recorded_ns"] = self._t["recorded_ns"]
-            course.conclude()
-        self._ended = all(course.ended for course in (self._course, *self._others))
+        for axis in self._more:
+            axis.t["recorded_ns"] = t["recorded_ns"]

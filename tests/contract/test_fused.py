@@ -45,7 +45,7 @@ from hil.runtime.guardian import (
 from hil.runtime.header import header_of
 from hil.runtime.inbox import Inbox, Place, ranges
 from hil.runtime.loop import RAMP_EVENT, Loop, Plan, StopRequest, Whole, no_whole, none_compiled
-from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, RAN, RECORDED, SENT, Pace, new_pace
+from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, PACINGS, RAN, RECORDED, SENT, Pace, Pacing, new_pace
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
@@ -567,15 +567,15 @@ CASES: dict[str, tuple[Act, set[int], str]] = {
     "late feedback": (late, {SENT}, "STOP_REQUESTED"),
     "emergency that is over": (emergency, {SENT, BEGUN}, "STOP_REQUESTED"),
     "emergency": (alarm, {SENT, BEGUN}, "STOP_REQUESTED"),
-    "late emergency": (emergency_late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
+    "late emergency": (emergency_late, {SENT, BEGUN}, "STOP_REQUESTED"),
     "late frames and an emergency": (and_judged(late_and_judged, 31, 51), {SENT, BEGUN}, "STOP_REQUESTED"),
-    "second master between ticks": (second_master_late, {SENT, NOT_BEGUN}, "FOREIGN_COMMAND"),
+    "second master between ticks": (second_master_late, {SENT, BEGUN}, "FOREIGN_COMMAND"),
     "strangers' frames": (strangers, {SENT}, "STOP_REQUESTED"),
     "second master": (second_master, {SENT, BEGUN}, "FOREIGN_COMMAND"),
     "wrong length": (wrong_length, {SENT}, "STOP_REQUESTED"),
-    "the other end is gone": (gone, {SENT, BEGUN, NOT_BEGUN, DECIDED}, "BUS_DOWN"),
-    "the queue is full": (deaf, {SENT, BEGUN, NOT_BEGUN, DECIDED}, "SEND_FAILED"),
-    "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, "GUARDIAN"),
+    "the other end is gone": (gone, {SENT, BEGUN, DECIDED}, "BUS_DOWN"),
+    "the queue is full": (deaf, {SENT, BEGUN, DECIDED}, "SEND_FAILED"),
+    "the guardian fires": (fired, {SENT, DECIDED, BEGUN}, "GUARDIAN"),
     "the guardian dies": (guardian_dies, {SENT}, "GUARDIAN_LOST"),
     "a set-point": (asked_for_a_speed, {SENT}, "STOP_REQUESTED"),
     "the writer fails": (writer_fails, {SENT}, "LOG_FAILED"),
@@ -608,16 +608,15 @@ def test_the_ramp_of_a_stop_is_compiled(both: Both) -> None:
 
 
 def test_a_tick_without_feedback_that_is_due_waits_for_none(both: Both) -> None:
-    """One that is left to the loop before it has begun, too."""
+    """One that is left to the loop before SYNC is out, too."""
     rules, compiled = both(("seldom", "emergency"))
     assert_same(rules, compiled)
     waited = compiled.log.ticks["received_ns"]
-    assert compiled.stages[NOT_BEGUN] == 2 and compiled.ended == "STOP_REQUESTED"
+    assert compiled.stages[BEGUN] == 2 and compiled.ended == "STOP_REQUESTED"
     assert (waited[32], waited[50]) == (0, 0) and waited[33] == waited[51] == ANSWER_NS
 
 
-LATE = ("late emergency", "second master between ticks")
-EXACT = {name for name, (_, left, _) in CASES.items() if left <= {SENT, BEGUN} or name in LATE}
+EXACT = {name for name, (_, left, _) in CASES.items() if left <= {SENT, BEGUN}}
 """Where the drive listens to the end, the stages are known exactly."""
 
 
@@ -637,21 +636,21 @@ def test_a_compiled_tick_is_the_loops_own(name: str, both: Both) -> None:
 
 
 FOLLOWED: dict[str, tuple[Act, set[int], str]] = {
-    # the same where the drive's own feedback wakes the loop; the first tick is the loop's
-    "calm": (calm, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "wrong crc": (wrong_crc, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "repeated counter": (repeated, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "jump of the counter": (jumped, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "no feedback": (silent, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "a heap": (heap, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "emergency that is over": (emergency, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
-    "emergency behind feedback": (emergency_behind, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
-    "emergency": (alarm, {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
-    "strangers' frames": (strangers, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "second master": (second_master, {SENT, NOT_BEGUN, BEGUN}, "FOREIGN_COMMAND"),
-    "wrong length": (wrong_length, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "the other end is gone": (gone, {SENT, NOT_BEGUN, BEGUN, DECIDED}, "SEND_FAILED"),
-    "the guardian fires": (fired, {SENT, NOT_BEGUN, BEGUN}, "GUARDIAN"),
+    # the same where the drive's own feedback wakes the loop
+    "calm": (calm, {SENT}, "STOP_REQUESTED"),
+    "wrong crc": (wrong_crc, {SENT}, "STOP_REQUESTED"),
+    "repeated counter": (repeated, {SENT}, "STOP_REQUESTED"),
+    "jump of the counter": (jumped, {SENT}, "STOP_REQUESTED"),
+    "no feedback": (silent, {SENT}, "STOP_REQUESTED"),
+    "a heap": (heap, {SENT}, "STOP_REQUESTED"),
+    "emergency that is over": (emergency, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "emergency behind feedback": (emergency_behind, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "emergency": (alarm, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "strangers' frames": (strangers, {SENT}, "STOP_REQUESTED"),
+    "second master": (second_master, {SENT, BEGUN}, "FOREIGN_COMMAND"),
+    "wrong length": (wrong_length, {SENT}, "STOP_REQUESTED"),
+    "the other end is gone": (gone, {SENT, BEGUN, DECIDED}, "SEND_FAILED"),
+    "the guardian fires": (fired, {SENT, BEGUN}, "GUARDIAN"),
 }
 
 
@@ -661,7 +660,6 @@ def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, both: B
     rules, compiled = both(("by feedback", name), 'loop.pacing="feedback"')
     assert_same(rules, compiled)
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
-    assert compiled.stages[NOT_BEGUN] == 1 or ended in ("SEND_FAILED", "GUARDIAN")
     assert max(compiled.together) == TOGETHER
     assert (BEGUN in compiled.stages) == (BEGUN in left)
     assert compiled.ended == ended and not rules.stages
@@ -669,18 +667,41 @@ def test_a_compiled_tick_that_feedback_wakes_is_the_loops_own(name: str, both: B
 
 BY_THE_KERNEL: dict[str, tuple[Act, set[int], str]] = {
     # SYNC is sent by a timer, and heard with its stamps; each SYNC is a period
-    "calm": (timed(calm), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "no feedback": (timed(silent), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "no SYNC": (timed(calm, 40, 41), {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "late feedback": (answered_late, {SENT, NOT_BEGUN}, "STOP_REQUESTED"),
-    "another's SYNC": (sync_of_another, {SENT, NOT_BEGUN}, "FOREIGN_COMMAND"),
-    "emergency": (timed(alarm), {SENT, NOT_BEGUN, BEGUN}, "STOP_REQUESTED"),
-    "the guardian fires": (timed(fired), {SENT, NOT_BEGUN, BEGUN}, "GUARDIAN"),
+    "calm": (timed(calm), {SENT}, "STOP_REQUESTED"),
+    "no feedback": (timed(silent), {SENT}, "STOP_REQUESTED"),
+    "no SYNC": (timed(calm, 40, 41), {SENT}, "STOP_REQUESTED"),
+    "late feedback": (answered_late, {SENT}, "STOP_REQUESTED"),
+    "another's SYNC": (sync_of_another, {SENT}, "FOREIGN_COMMAND"),
+    "emergency": (timed(alarm), {SENT, BEGUN}, "STOP_REQUESTED"),
+    "the guardian fires": (timed(fired), {SENT, BEGUN}, "GUARDIAN"),
 }
+BY_THE_TIMER: dict[str, tuple[Act, set[int], str]] = {
+    # nobody sends SYNC, and the loop takes what is there
+    "calm": (calm, {SENT}, "STOP_REQUESTED"),
+    "no feedback": (silent, {SENT}, "STOP_REQUESTED"),
+    "a heap": (heap, {SENT}, "STOP_REQUESTED"),
+    "emergency behind feedback": (emergency_behind, {SENT, BEGUN}, "STOP_REQUESTED"),
+    "second master": (second_master, {SENT, BEGUN}, "FOREIGN_COMMAND"),
+    "the guardian fires": (fired, {SENT, BEGUN}, "GUARDIAN"),
+}
+
+
+@pytest.mark.parametrize("name", BY_THE_TIMER)
+def test_a_compiled_tick_by_the_timer_is_the_loops_own(name: str, both: Both) -> None:
+    _, left, ended = BY_THE_TIMER[name]
+    rules, compiled = both(("by the timer", name), 'loop.pacing="timer"')
+    assert_same(rules, compiled)
+    assert set(compiled.stages) - {RECORDED} == left and compiled.stages[RECORDED] > 20, compiled.stages
+    assert compiled.ended == ended and not rules.stages and max(compiled.together) == TOGETHER
+    age_ns = -compiled.log.ticks["received_ns"][5:]
+    assert (age_ns > PERIOD_NS).any() == (name == "no feedback")
+
+
 TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
     "by us": CASES,
     "by feedback": FOLLOWED,
     "by the kernel": BY_THE_KERNEL,
+    "by the timer": BY_THE_TIMER,
     "ramp": {"stop": (stopped, set(), "STOP_REQUESTED")},
     "seldom": {"emergency": (seldom, set(), "STOP_REQUESTED")},
 }
@@ -731,15 +752,17 @@ class Parts:
         return True
 
 
-def test_a_tick_that_is_late_by_a_period_is_the_loops(parts: Parts) -> None:
-    before = parts.record.tobytes()
-    assert parts.whole(7, time.monotonic_ns() - PATIENT_NS, False) == NOT_BEGUN
-    assert parts.silent() and parts.record.tobytes() == before
+def test_a_tick_that_is_late_by_periods_is_the_one_whose_time_it_is(parts: Parts) -> None:
+    due_ns = time.monotonic_ns() - 3 * PATIENT_NS
+    assert parts.whole(7, due_ns, False) == SENT
+    tick = parts.record[0]
+    assert (tick["k"], tick["t_ns"], tick["gap"], tick["skipped"]) == (10, due_ns + 3 * PATIENT_NS, 4, 3)
+    assert 0 <= tick["lateness_ns"] < PATIENT_NS
 
 
 def test_nothing_is_sent_once_the_guardian_has_fired(parts: Parts) -> None:
     parts.words.cells[FIRED] = 1
-    assert parts.whole(7, time.monotonic_ns(), False) == NOT_BEGUN
+    assert parts.whole(7, time.monotonic_ns(), False) == BEGUN
     assert parts.silent() and parts.words.cells[BEAT_NS] > 0
 
 
@@ -769,19 +792,14 @@ def test_a_tick_sleeps_to_its_deadline(parts: Parts) -> None:
     assert stamps == sorted(stamps) and stamps[0] >= 0 and stamps[1] >= TIMEOUT_NS
 
 
-def test_what_has_no_sync_or_no_socket_is_the_loops(tmp_path: Path, channel: str) -> None:
-    setup = setup_of()
-    machine, recorder = (
-        setup.machine,
-        open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "x"), 1000),
-    )
-    other = open_link(BusSettings("virtual", channel))
-    with ends() as (ours, _):
-        for link, pacing in ((SocketLink(None, ours, ours), "timer"), (other, "sync"), (other, "feedback")):
-            client = DriveClient(link, setup.database)
-            client.prepare(recorder.record[0])
-            plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
-            parts = client, None, machine, recorder, plan, StopRequest(), new_pace()
-            assert fused.whole_tick(*parts) is none_compiled
-    other.close()
+@pytest.mark.parametrize("pacing", PACINGS)
+def test_what_has_no_socket_is_the_loops(tmp_path: Path, channel: str, pacing: Pacing) -> None:
+    setup, link = setup_of(), open_link(BusSettings("virtual", channel))
+    machine, header = setup.machine, header_of(setup, "run", "x")
+    recorder = open_recorder(tmp_path / "run.mcap", header, 1000)
+    client, plan = DriveClient(link, setup.database), Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
+    client.prepare(recorder.record[0])
+    parts = client, None, machine, recorder, plan, StopRequest(), new_pace()
+    assert fused.whole_tick(*parts) is none_compiled
+    link.close()
     recorder.close({})

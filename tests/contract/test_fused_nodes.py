@@ -31,7 +31,7 @@ from hil.runtime.loop import Plan, StopRequest, Whole, no_whole
 from hil.runtime.nodes import Axis, NodesLoop
 from hil.runtime.nodesession import _places, nodes_header
 from hil.runtime.nodesetup import load_node_setups
-from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, RAN, RECORDED, SENT, Pace
+from hil.runtime.rules import BEGUN, DECIDED, RAN, READ, RECORDED, SENT, Pace
 from hil.runtime.session import set_by_others
 from hil.runtime.setup import Overrides
 from hil.signals import FIELDS, Reason, RxFlag
@@ -335,21 +335,21 @@ CASES: dict[str, tuple[Act, set[int], list[str]]] = {
     "late feedback of the load": (late(LOAD), {SENT}, [STOP, STOP]),
     "motor's error that is over": (emergency(MOTOR), {SENT, BEGUN}, [STOP, STOP]),
     "load's error that is over": (emergency(LOAD), {SENT, BEGUN}, [STOP, STOP]),
-    "motor's error": (emergency(MOTOR, 0x4310), {SENT, BEGUN, DECIDED}, ["DRIVE_FAULT", OTHER]),
-    "load's error": (emergency(LOAD, 0x4310), {SENT, BEGUN, DECIDED}, [OTHER, "DRIVE_FAULT"]),
-    "the load's fault": (fault, {SENT, DECIDED}, [OTHER, "DRIVE_FAULT"]),
+    "motor's error": (emergency(MOTOR, 0x4310), {SENT, BEGUN, READ}, ["DRIVE_FAULT", OTHER]),
+    "load's error": (emergency(LOAD, 0x4310), {SENT, BEGUN, READ}, [OTHER, "DRIVE_FAULT"]),
+    "the load's fault": (fault, {SENT, READ}, [OTHER, "DRIVE_FAULT"]),
     "motor's late error": (emergency_late(MOTOR), {SENT, BEGUN}, [STOP, STOP]),
     "load's late error": (emergency_late(LOAD), {SENT, BEGUN}, [STOP, STOP]),
-    "another commands the motor": (second_master(MOTOR), {SENT, BEGUN, DECIDED}, ["FOREIGN_COMMAND", OTHER]),
-    "another commands the load": (second_master(LOAD), {SENT, BEGUN, DECIDED}, [OTHER, "FOREIGN_COMMAND"]),
-    "the motor's end is gone": (gone(MOTOR), {SENT, BEGUN, NOT_BEGUN, DECIDED}, ["BUS_DOWN", "BUS_DOWN"]),
-    "the load's end is gone": (gone(LOAD), {SENT, BEGUN, NOT_BEGUN, DECIDED}, [OTHER, "SEND_FAILED"]),
-    "gone before the commands": (cut, {SENT, BEGUN, NOT_BEGUN, DECIDED}, [OTHER, "SEND_FAILED"]),
-    "the guardian fires": (fired, {SENT, DECIDED, NOT_BEGUN}, ["GUARDIAN", "GUARDIAN"]),
-    "the guardian dies": (guardian_dies, {SENT, DECIDED}, ["GUARDIAN_LOST", "GUARDIAN_LOST"]),
+    "another commands the motor": (second_master(MOTOR), {SENT, BEGUN, READ}, ["FOREIGN_COMMAND", OTHER]),
+    "another commands the load": (second_master(LOAD), {SENT, BEGUN, READ}, [OTHER, "FOREIGN_COMMAND"]),
+    "the motor's end is gone": (gone(MOTOR), {SENT, BEGUN, READ, DECIDED}, ["BUS_DOWN", "BUS_DOWN"]),
+    "the load's end is gone": (gone(LOAD), {SENT, BEGUN, READ, DECIDED}, [OTHER, "SEND_FAILED"]),
+    "gone before the commands": (cut, {SENT, BEGUN, READ, DECIDED}, [OTHER, "SEND_FAILED"]),
+    "the guardian fires": (fired, {SENT, BEGUN, DECIDED}, ["GUARDIAN", "GUARDIAN"]),
+    "the guardian dies": (guardian_dies, {SENT, READ}, ["GUARDIAN_LOST", "GUARDIAN_LOST"]),
     "a stop": (stopped, {SENT}, [STOP, STOP]),
     "a stop of one before the other": (stopped_turning, {SENT}, [STOP, STOP]),
-    "a quick stop": (stopped_at_once, {SENT, DECIDED}, ["QUICK_STOP_REQUESTED", "QUICK_STOP_REQUESTED"]),
+    "a quick stop": (stopped_at_once, {SENT, READ}, ["QUICK_STOP_REQUESTED", "QUICK_STOP_REQUESTED"]),
 }  # fmt: skip
 
 
@@ -366,7 +366,7 @@ def test_a_compiled_tick_of_two_nodes_is_the_loops_own(
     assert compiled.ended == ended
     assert set(compiled.stages) - {RECORDED} <= left and compiled.stages[RECORDED] > 20, compiled.stages
     if case == "the load's fault":
-        assert compiled.stages[DECIDED] == 1, "the laws had run, then the other one stopped"
+        assert compiled.stages[READ] == 1, "the laws had run, then the other one stopped"
     if case == "a stop of one before the other":
         ended = compiled.log("load").ticks["reason"] != 0
         assert ended.sum() > 25 and compiled.stages[SENT] < 20, (

@@ -30,7 +30,7 @@ MAY_SEND = {
 LINKS = {"drivers/bus.py", "drivers/local.py"}
 NO_CONTROLLER = {"drivers/bare.py"}  # the benchmark's loop without control: refuses what may be a real bus
 # who may ask a drive port to send: the loop, with the tick that the guard has judged, and its wrapper
-MAY_ASK = {("hil/runtime/loop.py", "_send"), ("hil/runtime/guardian.py", "send")}
+MAY_ASK = {("hil/runtime/loop.py", "answer"), ("hil/runtime/guardian.py", "send")}
 
 
 def sends(path: Path, owner: str) -> set[tuple[str, str]]:
