@@ -3,7 +3,7 @@
     python -m benchmarks.adaptive_window [CONFIG] [--json] [--seeds 4] [--effort 1]
 
 Laws are tuned by the optimiser of `hil compare` for the same limits of Ms (1.6, in the worst corner 2.2):
-fixed windows for 100 mV of noise in u_q and for the adaptive one's 12 mV (linear, without decoupling).
+fixed windows for 100 mV of noise in u_q and for the adaptive one's 12 mV, at speed, as `hil design` does.
 Each runs in `hil simulate` on CONFIG (configs/rigid.toml). Of the mean over the seeds a cell has, for a load
 step, the largest |w - w*| [rad/s] and the time until a tenth of it or 0.05 rad/s [ms], else its rms [mrad/s].
 """
@@ -16,20 +16,18 @@ import math
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from rich.table import Table
 
-from hil.config.design import law_spec
 from hil.config.shipped import find_config
 from hil.control.law import new_law_state
 from hil.report.view import show
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.sim.simulate import simulate_ticks
-from hil.tuning.bench import bench_of, speed_drive
+from hil.tuning.bench import bench_of, spec_in, speed_drive
 from hil.tuning.families import Tables, family, settings_of, toml
 from hil.tuning.loop import count_alarms
 from hil.tuning.optimise import Limits, law_of, tune
@@ -62,10 +60,8 @@ SCENARIOS: Final[dict[str, Scenario]] = {
 def tuned(path: Path, name: str, u_mv: float, effort: float) -> dict[str, Any]:
     """A law's tables and what the linear loop says of them."""
     setup = speed_drive(path, Overrides())
-    bench = replace(bench_of(path, setup), u_noise=0.0, w_0=0.0)
-    found = tune(
-        family(name), bench, Limits(u_mv * 1e-3, MS, MS_WORST), law_spec(setup.config), effort=effort
-    )
+    limits = Limits(u_mv * 1e-3, MS, MS_WORST)
+    found = tune(family(name), bench_of(path, setup), limits, spec_in(setup), effort=effort)
     linear = found.verdict.as_dict()
     return {
         "law": name,
@@ -121,7 +117,7 @@ def alarms_in_an_hour(path: Path, tables: Tables) -> int:
     """Alarms of the adaptive windows in an hour of noise and rounding, the motor at rest."""
     setup = speed_drive(path, Overrides())
     bench = bench_of(path, setup)
-    law, lsb = law_of(tables, law_spec(setup.config), bench.T_s)[0], np.array(setup.wire.x_lsb)
+    law, lsb = law_of(tables, spec_in(setup), bench.T_s)[0], np.array(setup.wire.x_lsb)
     w, i = (
         math.sqrt(noise**2 - q**2 / 12) for noise, q in zip((bench.w_noise, bench.i_noise), lsb, strict=False)
     )

@@ -184,12 +184,15 @@ def side_by_side(*windows: Window) -> Window:
     own = {name: np.concatenate([getattr(w, name) for w in windows], axis=-1) for name in every}
     if not any(len(w.form) for w in windows):
         return Window(**own)
-    from scipy.linalg import block_diag  # loads as long as numpy
-
     rows = {"form": (), "third": (3,), "g": (FIR_MAX,), "short": (), "first": ()}
     for name, shape in rows.items():
         own[name] = np.concatenate([_part(w, name, (*shape, w.n)) for w in windows], axis=-1)
-    square = {name: block_diag(*(_part(w, name, (w.n, w.n)) for w in windows)) for name in ("M", "W", "S")}
+    square: dict[str, Any] = {name: np.zeros((own["N"].size, own["N"].size)) for name in ("M", "W", "S")}
+    first = 0
+    for w in windows:
+        for name, whole in square.items():
+            whole[first : first + w.n, first : first + w.n] = _part(w, name, (w.n, w.n))
+        first += w.n
     return Window(**own, **square)
 
 
@@ -243,6 +246,25 @@ def fill(v: Array, h: Array, past: Array) -> None:
 
 
 @jit
+def weigh_past(p: Any, s: Any) -> None:
+    """work = sum_j g_j v_{k-j} over the longest FIR; the weights of a shorter one are 0 after its N.
+
+    The channels side by side: one sum waits for its last addition, three do not wait for each other.
+    """
+    head, size, longest = s["head"], s["past"].shape[0], 0
+    for c in range(3):
+        if p["form"][c] == FIR:
+            longest = max(longest, p["N"][c])
+    w, q, d = 0.0, 0.0, 0.0
+    for j in range(longest):
+        at = (head - j) % size
+        w += p["g"][j, 0] * s["past"][at, 0, 0]
+        q += p["g"][j, 1] * s["past"][at, 0, 1]
+        d += p["g"][j, 2] * s["past"][at, 0, 2]
+    s["work"][0], s["work"][1], s["work"][2] = w, q, d
+
+
+@jit
 def shape_step(p: Any, s: Any) -> None:
     """Write d_hat of the channels of another form than PAIR, after :func:`window_step`; p, s: the records.
 
@@ -250,12 +272,10 @@ def shape_step(p: Any, s: Any) -> None:
     ADAPTIVE: see :mod:`hil.control.adaptive`.
     """
     v, head, size = s["v"], s["head"], s["past"].shape[0]
+    weigh_past(p, s)
     for c in range(3):
         if p["form"][c] == FIR:
-            total = 0.0
-            for j in range(p["N"][c]):
-                total += p["g"][j, c] * s["past"][(head - j) % size, 0, c]
-            s["d_hat"][c] = total
+            s["d_hat"][c] = s["work"][c]
         elif p["form"][c] == THIRD:
             value = p["third"][0, c] * s["h_3"][c] + (1.0 - p["third"][0, c]) * v[c]
             s["h_3"][c] = value

@@ -17,6 +17,7 @@ from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import Reason, TickArray
 from hil.sim.emulate import load_plant
 from hil.sim.simulate import simulate_ticks
+from hil.tuning.current import Regulator
 from hil.tuning.measure import Bench
 
 LATEST: Final = 4.0
@@ -133,6 +134,8 @@ def bench_of(path: Path, setup: Setup, given: dict[str, float | None] | None = N
         brake = kind == "brake"
         if plant.coupling is not None and not more.get("shafts"):
             known = known or (_elastic(plant.masses),)
+        if not takes_voltage(setup):
+            more |= {"regulator": _regulator(plant.firmware, setup.config.loop.rate_hz)}
     if known and not more.get("shafts"):
         more |= {"shafts": known, "elastic": takes_voltage(setup)}
     if (given_shaft := elastic_shaft(setup.config.motor)) is not None:
@@ -181,6 +184,14 @@ def _elastic(shaft: Any) -> tuple[float, float, float]:
     """Resonance [Hz], damping ratio d w_r / 2c, and the motor's share of J, of a plant's masses."""
     w_r = shaft.resonance_rad_s
     return w_r / (2.0 * math.pi), 0.5 * shaft.d * w_r / shaft.c, shaft.J_m / (shaft.J_m + shaft.J_l)
+
+
+def _regulator(firmware: Any, rate_hz: float) -> Regulator | None:
+    """The current loop of an emulated drive; None where a tick is no whole number of its samples."""
+    period = firmware.current_period_us / 1e6
+    count = 1.0 / (rate_hz * period)
+    whole = count > 0.5 and abs(count - round(count)) < 1e-9 * count
+    return Regulator(period, firmware.current_loop_rad_s) if whole else None
 
 
 def _own_loop(setup: Setup, spread: dict[str, float]) -> dict[str, Any]:

@@ -42,29 +42,45 @@ RESTLESS: Final = 0.02
 """Share of a response's peak that may be left in its last tenth."""
 
 
+@dataclass(frozen=True, slots=True)
+class Regulator:
+    """A drive's sampled current loop as far as it is known: PI at ``period`` [s], ``bandwidth`` [rad/s]."""
+
+    period: float
+    bandwidth: float
+
+
 def shaft_of(
     motor: MotorModel,
     inner: InnerLoop,
     given: SpeedFilter | None,
     T_s: float,
     masses: tuple[Array, Array] | None = None,
+    regulator: Regulator | None = None,
 ) -> Plant:
     """The plant behind a current loop, exact for u and T_L held over a tick; x = (w, i, ..., filter).
 
     ``given`` filters the speed, whatever the observer knows of it; ``masses``: one inertia, or
-    :func:`hil.tuning.loop.two_masses`; without them the shaft that the observer knows, or none.
+    :func:`hil.tuning.loop.two_masses`; without them the shaft that the observer knows, or none. The current
+    loop is a lag, or with ``regulator`` the drive's own samples (:func:`_regulated`).
     """
     given = given or SpeedFilter()
     if masses is None:
         masses = one_mass(motor) if inner.shaft is None else two_masses(motor, *inner.shaft.elastic)
     own, load = masses
-    n, f = len(own), 2 if len(given.poles) == 2 else int(bool(given.poles or given.ticks))
+    m, f = len(own), 2 if len(given.poles) == 2 else int(bool(given.poles or given.ticks))
+    n = m + (regulator is not None)
     A, B = np.zeros((n + f, n + f)), np.zeros((n + f, 2))
-    A[:n, :n], B[:n, 1] = own, load
-    lag = inner.lag or 1e-4 * T_s
-    A[0, 1] *= inner.k_u / motor.k_t
-    A[1], B[1, 0] = 0.0, 1.0 / lag
-    A[1, 1] = -1.0 / lag
+    A[:m, :m], B[:m, 1] = own, load
+    amperes = inner.k_u / motor.k_t  # of a unit of the command
+    A[0, 1] *= amperes
+    if regulator:
+        A[1, 0] /= amperes
+        A[1, m] = B[1, 0] = 1.0 / motor.L_q
+    else:
+        lag = inner.lag or 1e-4 * T_s
+        A[1], B[1, 0] = 0.0, 1.0 / lag
+        A[1, 1] = -1.0 / lag
     if given.ticks:
         A[n, 0] = 1.0
     elif f == 1:
@@ -72,8 +88,31 @@ def shaft_of(
     elif f == 2:
         p, q = given.poles
         A[n, n + 1], A[n + 1, 0], A[n + 1, n], A[n + 1, n + 1] = 1.0, p * q, -p * q, -p - q
-    shaft = sampled(A, B, T_s, np.eye(n + f)[n if f else 0])
+    C = np.eye(n + f)[n if f else 0]
+    shaft = _regulated(A, B, T_s, C, m, motor, regulator) if regulator else sampled(A, B, T_s, C)
     return _mean(shaft, n, given.ticks, T_s) if given.ticks else shaft
+
+
+def _regulated(
+    A: Array, B: Array, T_s: float, C: Array, at: int, motor: MotorModel, regulator: Regulator
+) -> Plant:
+    """A tick of whole samples of a PI whose zero cancels the winding's pole; x[at] is its integral, as held.
+
+        u = k (i* - i) + I + n_p psi_f w,  I+ = I + k (1 - a) (i* - i),  k (1 - a) = (1 - l) R
+    with a = e^{-R T / L}, l = e^{-b T}: the current follows as by a lag of bandwidth b, but the voltage
+    against the back-EMF is held over each sample, which feeds the acceleration back.
+    """
+    reset = -math.expm1(-motor.R_s * regulator.period / motor.L_q)
+    gain = -math.expm1(-regulator.bandwidth * regulator.period) * motor.R_s / reset
+    one, n, count = sampled(A, B, regulator.period), len(A), round(T_s / regulator.period)
+    step = np.eye(n + 2)
+    step[:n, :n], step[:n, n], step[:n, n + 1] = one.A, one.b * gain, one.e
+    step[:n, 0] -= one.b * A[1, 0] / B[1, 0]
+    step[:n, 1] -= one.b * gain
+    step[at, 1] -= gain * reset
+    step[at, n] += gain * reset
+    whole = np.linalg.matrix_power(step, count)
+    return Plant(*(np.ascontiguousarray(part) for part in (whole[:n, :n], whole[:n, n], whole[:n, n + 1], C)))
 
 
 def _mean(shaft: Plant, first: int, ticks: int, T_s: float) -> Plant:

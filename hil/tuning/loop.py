@@ -205,6 +205,29 @@ def respond_turning(p: Any, s: Any, A: Array, B: Array, w: float, settles: bool,
 
 
 @jit
+def run_noisy(p: Any, s: Any, A: Array, B: Array, w: float, noise: Array, lsb: float, out: Array) -> None:
+    """u_q (K,) of a motor that runs at w (:func:`turning`), the last K ticks under ``noise`` (ticks, 5).
+
+    That is of w, i_q, i_d as measured and of u_q, u_d as they act; i_d is then rounded to multiples of lsb.
+    """
+    n, first = A.shape[0], len(noise) - len(out)
+    x, new = np.zeros(n), np.empty(n)
+    reset(s)
+    u_q, u_d = -B[1, 2] / B[1, 0], 0.0  # against the back-EMF
+    apply(s, 0.0, u_q, u_d)
+    for k in range(len(noise)):
+        on = noise[k]
+        i_d = np.rint((x[n - 1] + on[2]) / lsb) * lsb
+        observe(p, s, w + x[0] + on[0], x[1] + on[1], i_d, True, 1)
+        apply(s, 0.0, u_q, u_d)
+        command(p, s, w, 0.0, 0.0, NO_LIMIT)
+        if k >= first:
+            out[k - first] = s["u"][1]
+        move(A, B, u_q + on[3], u_d + on[4], 1.0, x, new)
+        u_q, u_d = s["u"][1], s["u"][2]
+
+
+@jit
 def respond_loaded(p: Any, s: Any, A: Array, B: Array, w: float, load: float, out: Array) -> None:
     """dw (K,) after a step of the load [N m] on a motor that runs at w (:func:`turning`), axes coupled.
 

@@ -23,7 +23,7 @@ from hil.control.law import SPEED, MotorModel, new_law_state
 from hil.control.linalg import Array
 from hil.control.registry import InnerLoop, SpeedFilter
 from hil.report.metrics import RECOVERED_RAD_S
-from hil.tuning.current import respond_each, shaft_of
+from hil.tuning.current import Regulator, respond_each, shaft_of
 from hil.tuning.loop import (
     LOAD,
     PULSE_I,
@@ -74,7 +74,8 @@ class Bench:
     ``brake``: the load step acts on the motor, not behind the shaft;
     ``i_d_noise`` is that of i_d with the resolution ``i_d_lsb`` [A] of its frame, which may be coarser than
     i_q's. Of a drive with a current loop of its own (``inner``) u is in its ``unit``, A or N m, and
-    ``filter`` is what its speed really comes through. ``known``: the shaft that the observer of a drive by
+    ``filter`` is what its speed really comes through, and ``regulator`` its loop, where more is known of it
+    than the lag that the law believes in. ``known``: the shaft that the observer of a drive by
     voltage has in its model.
     """
 
@@ -95,6 +96,7 @@ class Bench:
     filter: SpeedFilter | None = None
     unit: str = "V"
     known: Elastic | None = None
+    regulator: Regulator | None = None
 
     @property
     def every(self) -> int:
@@ -133,7 +135,7 @@ class Bench:
             at = self.inner.shaft.elastic
         inner = replace(self.inner, k_u=self.inner.k_u * motor.k_t / self.motor.k_t)
         masses = two_masses(motor, *at, self.brake) if at else None
-        return shaft_of(motor, inner, self.filter, self.T_s, masses)
+        return shaft_of(motor, inner, self.filter, self.T_s, masses, self.regulator)
 
     def shaft_places(self) -> list[Place]:
         """The believed motor and every corner on each elastic shaft, of whose damping SPARE is left."""
@@ -174,11 +176,12 @@ def _buffer(shape: tuple[int, ...]) -> Array:
 
 
 @functools.cache
-def _state() -> Record:
+def state() -> Record:
+    """A law's state that is used again; each response begins with a reset."""
     return new_law_state()
 
 
-def _free(law: Record) -> Record:
+def free(law: Record) -> Record:
     """The law without the limit of the current; and a load that is known is no part of its loop."""
     own = law.copy()
     own["cogs"], own["k_w2"], own["i_max"] = 0, 0.0, np.inf
@@ -190,14 +193,14 @@ def responses(law: Record, plants: Sequence[Plant], kinds: Array, ticks: int, cl
 
     Not ``closed``: those of the observer alone, of a drive with a current loop of its own.
     """
-    own = _free(law)
+    own = free(law)
     out = _buffer((len(plants), len(kinds), 4, ticks))
     A, b, e, C = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "b", "e", "C"))
     with np.errstate(over="ignore", invalid="ignore"):
         if own_loop(law):
-            respond_each(own[0], _state()[0], A, b, e, C, kinds, closed, out)
+            respond_each(own[0], state()[0], A, b, e, C, kinds, closed, out)
         else:
-            respond_all(own[0], _state()[0], A, b, e, kinds, out)
+            respond_all(own[0], state()[0], A, b, e, kinds, out)
     return out
 
 
@@ -297,33 +300,11 @@ def _coupled_noise(out: Array, bench: Bench) -> tuple[float, float]:
 def turning_responses(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, ticks: int) -> Array:
     """u_q, speed, i_d (5, 3, ticks) of :func:`hil.tuning.loop.respond_turning`, at the bench's speed."""
     at = at or bench.known
-    own, plant = _free(law), _turning(motor, bench.T_s, bench.w_0, at)
+    own, plant = free(law), turning_of(motor, bench.T_s, bench.w_0, at)
     out = _buffer((5, 3, ticks))
     with np.errstate(over="ignore", invalid="ignore"):
-        respond_turning(own[0], _state()[0], *plant, bench.w_0, at is None and motor is bench.motor, out)
+        respond_turning(own[0], state()[0], *plant, bench.w_0, at is None and motor is bench.motor, out)
     return out
-
-
-def foretold(law: Record, bench: Bench) -> list[tuple[float, float]]:
-    """Dip [rad/s] and noise of the command [bench.unit] with each plant, on its elastic shaft if it has one.
-
-    Infinite where the loop is unstable.
-    """
-    motors = (bench.motor, *bench.corners())
-    if not bench.shafts:
-        plants = bench.plants()
-        dips = [loop.dip for loop in loops(law, bench, plants)]
-        noises = [noise(law, bench, motor)[0] for motor in motors]
-        return list(zip(dips, noises, strict=True))
-    each = list(zip(motors, bench.turns(), strict=True))
-    calm = quiet(law, bench, each, RINGING_S, (bench.w_0,))
-    return [_ringing(law, bench, *one) if rests else UNQUIET for one, rests in zip(each, calm, strict=True)]
-
-
-def _ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> tuple[float, float]:
-    """Of :func:`foretold`, where the vibration outlasts the response that a dip is read from."""
-    dip = float(np.abs(ringing(law, bench, motor, at)).max())
-    return dip, noise(law, bench, motor, at, round(RINGING_S / bench.T_s))[0]
 
 
 def on_shaft(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, rigid: Loop) -> Loop:
@@ -337,10 +318,10 @@ def on_shaft(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None, r
 def ringing(law: Record, bench: Bench, motor: MotorModel, at: Elastic | None) -> Array:
     """The speed after the load step (ticks,); of a drive by voltage at the bench's speed, axes coupled."""
     if bench.inner is None:
-        own, out = _free(law), _buffer((bench.ticks,))
-        A, B = _turning(motor, bench.T_s, bench.w_0, at or bench.known, bench.brake)
+        own, out = free(law), _buffer((bench.ticks,))
+        A, B = turning_of(motor, bench.T_s, bench.w_0, at or bench.known, bench.brake)
         with np.errstate(over="ignore", invalid="ignore"):
-            respond_loaded(own[0], _state()[0], A, B, bench.w_0, bench.load, out)
+            respond_loaded(own[0], state()[0], A, B, bench.w_0, bench.load, out)
         return out
     stepped = to_unit_load(law, bench.load) if adapts(law) else law
     plant = bench.plant(motor, at)
@@ -388,7 +369,7 @@ def quiet(
 
 
 @functools.lru_cache(4096)
-def _turning(
+def turning_of(
     motor: MotorModel, T_s: float, w: float, at: Elastic | None, brake: bool = False
 ) -> tuple[Array, Array]:
     """:func:`hil.tuning.loop.turning` in one place."""
@@ -397,13 +378,13 @@ def _turning(
 
 def _vibrations(law: Record, bench: Bench, places: Sequence[Place], ticks: int, w: float) -> Array:
     """:func:`hil.tuning.loop.vibrate` at w in places of one kind, rigid or not; (places, ticks)."""
-    own, out, emf = _free(law), _buffer((len(places), ticks)), bench.motor.n_p * w * bench.motor.psi_f
+    own, out, emf = free(law), _buffer((len(places), ticks)), bench.motor.n_p * w * bench.motor.psi_f
     A, B = (
         np.array(part)
-        for part in zip(*(_turning(motor, bench.T_s, w, at) for motor, at in places), strict=True)
+        for part in zip(*(turning_of(motor, bench.T_s, w, at) for motor, at in places), strict=True)
     )
     with np.errstate(over="ignore", invalid="ignore"):
-        vibrate_all(own[0], _state()[0], A, B, w, emf, out)
+        vibrate_all(own[0], state()[0], A, B, w, emf, out)
     return out
 
 

@@ -86,7 +86,7 @@ class _Search:
     best: float = math.inf
     corners: list[Plant] = field(default_factory=list)
     seen: dict[tuple[float, ...], float] = field(default_factory=dict)
-    calm: set[tuple[float, ...]] = field(default_factory=set)
+    ringing: dict[tuple[float, ...], float] = field(default_factory=dict)
     nominal: Plant = field(init=False)
     every: list[Plant] = field(init=False)
     shafts: list[Place] = field(init=False)
@@ -118,9 +118,13 @@ class _Search:
         """What tells one candidate from another."""
         return tuple(np.round(self.numbers(y), 9))
 
-    def is_calm(self, y: Array) -> bool:
-        """Whether no shaft makes it vibrate; of what the search took for its best it is known."""
-        return self.key(y) in self.calm or all(quiet(self.law(y), self.bench, self.shafts))
+    def rings(self, y: Array, law: Record) -> float:
+        """The share of the shafts' places in which it vibrates on; asked once of each candidate."""
+        key = self.key(y)
+        if key not in self.ringing:
+            calm = quiet(law, self.bench, self.shafts)
+            self.ringing[key] = calm.count(False) / max(len(calm), 1)
+        return self.ringing[key]
 
     def _cost(self, y: Array) -> float:
         try:
@@ -145,11 +149,9 @@ class _Search:
             return 10.0 * (1 + over)
         value = min(u, 9.0) if self.aim == "noise" else min(worst_of(every).iae / self._scale, 9.0)
         if value < self.best:  # what is not the best need not be asked whether it may be
-            calm = quiet(law, self.bench, self.shafts)
-            if not all(calm):
-                return 20.0 + 10.0 * calm.count(False) / len(calm)
+            if rings := self.rings(y, law):
+                return 20.0 + 10.0 * rings
             self.best = value
-            self.calm.add(self.key(y))
         return value
 
     def _over(self, u: float, nominal: Any, worst: Any) -> float:
@@ -229,7 +231,7 @@ def tune(
     law = search.law(y)
     verdict = judge(law, bench)
     used = _use(verdict, limits)
-    calm = search.is_calm(y)
+    calm = not search.rings(y, law)
     near = tuple(name for name, share in used.items() if share > 0.985)
     return Tuned(
         family,

@@ -19,8 +19,9 @@ from hil.sim.demo import closed_loop, own_channel
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import Seen, bench_of, coupled, plant_settings, seen_in
 from hil.tuning.families import Tables, settings_of
+from hil.tuning.foretell import foretold
 from hil.tuning.loop import Record
-from hil.tuning.measure import Bench, foretold, noise_in
+from hil.tuning.measure import Bench, noise_in
 
 DIP_WITHIN: Final = 0.05
 NOISE_WITHIN: Final = 0.15

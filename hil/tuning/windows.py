@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,8 @@ def own_loop_figures(law: Record, bench: Bench, lsb: Array) -> dict[str, dict[st
 
     By the observer's own kernels, which no command answers here: d_hat after a step of d, and after one LSB.
     """
-    kinds = np.array([LOAD, PULSE_W, PULSE_I])
-    d = responses(law, [bench.plant(bench.motor)], kinds, bench.ticks, closed=False)[0, :, 3]
+    kinds, believed = np.array([LOAD, PULSE_W, PULSE_I]), replace(bench, regulator=None)
+    d = responses(law, [believed.plant(bench.motor)], kinds, bench.ticks, closed=False)[0, :, 3]
     step, by_w, by_i = -bench.motor.J * d[0], d[1], d[2] * law["u_i"][0]
     energy, size = ((by_w**2).sum(), (by_i**2).sum()), (np.abs(by_w).sum(), np.abs(by_i).sum())
     sigma = np.array([bench.w_noise, bench.i_noise])

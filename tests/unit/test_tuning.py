@@ -21,16 +21,17 @@ from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, plant_settings, seen_in, simulated
 from hil.tuning.compare import parse_laws
 from hil.tuning.families import FAMILIES, family, settings_of, toml
+from hil.tuning.foretell import foretold
 from hil.tuning.loop import rigid, shaft
 from hil.tuning.measure import (
     UNQUIET,
     Bench,
     Loop,
-    foretold,
     held,
     judge,
     loops,
     margins,
+    noise,
     on_shaft,
     quiet,
 )
@@ -42,6 +43,7 @@ from tests.conftest import CONFIGS
 pytestmark = pytest.mark.slow
 
 DEMO = CONFIGS / "demo.toml"
+RIGID = CONFIGS / "rigid.toml"
 OLD = (
     'controller={kind="cascade", speed_pole_rad_s=30.0, current_pole_rad_s=250.0}',
     'observer.speed={kind="ftdob", gamma_1_rad_s=25.0, gamma_2_rad_s=58.0, delay_ms=12.0}',
@@ -174,12 +176,30 @@ def test_noise_is_foretold_on_an_elastic_shaft_through_a_coarse_frame() -> None:
     """Rounding of i_d as white noise in a loop of full gain is up to 27 % off."""
     setup = load_setup(DEMO, Overrides(settings=settings_of(SOFT)))
     at = bench_of(DEMO, setup, shafts=((120.0, 0.01, 0.5),))
-    for j, ((dip, u_noise), plant) in enumerate(
-        zip(foretold(setup.machine.law, at), plant_settings(at), strict=True)
+    motors = (at.motor, *at.corners())
+    for j, ((dip, u_noise), motor, plant) in enumerate(
+        zip(foretold(setup.machine.law, at), motors, plant_settings(at), strict=True)
     ):
         seen = seen_in(simulate_ticks(setup, plant), 1e-3)
         assert seen.dip == pytest.approx(dip, rel=0.05), j
-        assert mean_noise(setup, plant, seen, 1e-3) == pytest.approx(u_noise, rel=0.08), j
+        measured = mean_noise(setup, plant, seen, 1e-3)
+        assert measured == pytest.approx(u_noise, rel=0.08), j
+        linearised = noise(setup.machine.law, at, motor, at.shafts[0], 4000)[0]
+        assert measured == pytest.approx(linearised, rel=0.08), j
+
+
+def test_noise_that_comes_in_bursts_is_foretold() -> None:
+    """In one corner i_d now stays within the middle step of its frame and now swings out of it."""
+    window = {"kind": "adaptive", "delay_ms": 33.0, "first_ms": 3.0, "w_noise_rad_s": 0.01041}
+    window |= {"i_noise_a": 0.003512}
+    own = {"controller": {"kind": "cascade", "speed_pole_rad_s": 122.6, "current_pole_rad_s": 772.6}}
+    own |= {"speed": window | {"short_ms": 17.0}, "current": window | {"short_ms": 16.0}}
+    setup = load_setup(RIGID, Overrides(settings=settings_of(own)))
+    bench = bench_of(RIGID, setup)
+    plant, motor = plant_settings(bench)[5], bench.corners()[4]
+    measured = mean_noise(setup, plant, seen_in(simulate_ticks(setup, plant), 1e-3), 1e-3)
+    assert measured == pytest.approx(foretold(setup.machine.law, bench)[5][1], rel=0.1)
+    assert measured > 1.15 * noise(setup.machine.law, bench, motor)[0], "a linearisation knows one state"
 
 
 def test_a_loop_that_is_unstable_turning_alone_is_not_calm() -> None:

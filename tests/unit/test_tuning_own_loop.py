@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from firmware_model import drive as emulated
+from firmware_model.config import PlantConfig, Wire, build_params, new_state
+from firmware_model.plant import State
 from hil.cli import main
 from hil.config.filtered import loop_through
 from hil.control.law import design_law
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.sim.simulate import simulate_ticks
 from hil.tuning.bench import bench_of, seen_in, spec_in
+from hil.tuning.current import Regulator, shaft_of
 from hil.tuning.families import OWN_LOOP, settings_of, toml
+from hil.tuning.foretell import foretold
 from hil.tuning.measure import Bench, judge, loops, margins, quiet
 from hil.tuning.optimise import law_of
-from hil.tuning.verify import plants_of, verdict, verify
+from hil.tuning.verify import mean_noise, plants_of, verdict, verify
 from hil.tuning.windows import own_loop_figures
 from tests.conftest import CONFIGS
 
@@ -86,6 +92,56 @@ def test_the_linear_loop_foretells_the_simulation(name: str, corner: str) -> Non
     seen = seen_in(simulate_ticks(setup, plants_of(bench)[corner]), bench.T_s)
     assert seen.dip == pytest.approx(said.nominal.dip, rel=0.05)
     assert seen.u_noise == pytest.approx(said.u_noise, rel=0.15)
+
+
+@pytest.mark.parametrize("period_us", [50, 100, 1000])
+def test_the_sampled_current_loop_is_the_emulated_drive_s(period_us: int) -> None:
+    """Tick by tick, also while it accelerates: i_d and its coupling are of third order here."""
+    bench = drive("current")[1]
+    motor = replace(bench.motor, B_f=0.0)
+    keys = {"R_s_ohm": motor.R_s, "L_d_h": motor.L_d, "L_q_h": motor.L_q, "psi_f_wb": motor.psi_f}
+    keys |= {"n_p": motor.n_p, "J_kg_m2": motor.J, "B_f_n_m_s": 0.0}
+    firmware = {"takes": "current", "current_period_us": period_us, "current_loop_rad_s": 800.0}
+    inverter = {"v_dc_v": 540.0, "resolution_v": 0.0}
+    p = build_params(
+        PlantConfig.model_validate(
+            {"dbc": "none.dbc", "motor": keys, "firmware": firmware, "inverter": inverter}
+        ),
+        Wire(0.01, 327.67, 0.001, 32.767, 0.01, 20.47),
+    )
+    s = new_state(p, 15)[0]
+    s["started"], s["state"] = 1, State.OPERATION_ENABLED.value
+    assert bench.inner is not None
+    plant = shaft_of(motor, bench.inner, None, bench.T_s, None, Regulator(period_us * 1e-6, 800.0))
+    x = np.zeros(len(plant.A))
+    for k, u in enumerate((1e-3, 1e-3, -2e-3, 5e-4, 0.0, 0.0)):
+        emulated.on_command(s, k + 1, 0x0F, u, 0.0)
+        emulated.latch(p[0], s)
+        emulated.advance(p[0], s, 1_000_000)
+        x = plant.A @ x + plant.b * u
+        assert s["x"][:2] == pytest.approx(x[:2], rel=1e-7, abs=1e-11)
+
+
+def test_a_corner_near_its_limit_on_a_shaft_is_foretold() -> None:
+    """A voltage that is held against the back-EMF feeds the acceleration back: here that is damping."""
+    own = tables(286.73, 22.0)
+    setup, bench = drive("current", *settings_of(own), *QUICK, shafts=((60.0, 0.01, 0.5),))
+    rows = dict(zip(list(plants_of(bench))[1:], foretold(setup.machine.law, bench), strict=True))
+    assert max(rows, key=lambda name: rows[name][1]) == "corner 2"
+    by_lag = foretold(setup.machine.law, replace(bench, regulator=None))
+    for name in ("as believed", "corner 2"):
+        plant = plants_of(bench)[name]
+        seen = seen_in(simulate_ticks(setup, plant), bench.T_s)
+        assert seen.dip == pytest.approx(rows[name][0], rel=0.05)
+        noise = mean_noise(setup, plant, seen, bench.T_s)
+        assert noise == pytest.approx(rows[name][1], rel=0.1)
+    assert abs(by_lag[list(rows).index("corner 2")][1] / noise - 1) > 0.15
+
+
+def test_ticks_of_no_whole_number_of_current_samples_are_judged_by_the_lag() -> None:
+    assert drive("current")[1].regulator == Regulator(5e-5, 1000.0)
+    assert drive("current", "loop.rate_hz=800")[1].regulator == Regulator(5e-5, 1000.0)
+    assert drive("current", "loop.rate_hz=1600")[1].regulator is None
 
 
 def test_a_filter_that_the_observer_does_not_know_is_in_the_plant_all_the_same() -> None:
