@@ -3,7 +3,8 @@
     python -m benchmarks.adaptive_window [CONFIG] [--json] [--seeds 4] [--effort 1]
 
 Laws are tuned by the optimiser of `hil compare` for the same limits of Ms (1.6, in the worst corner 2.2):
-fixed windows for 100 mV of noise in u_q and for the adaptive one's 12 mV, at speed, as `hil design` does.
+12 mV of noise in u_q at speed, as `hil design` counts it, for the adaptive one; fixed windows for 100 mV, and
+for 18 mV, since none of them comes to 12.
 Each runs in `hil simulate` on CONFIG (configs/rigid.toml). Of the mean over the seeds a cell has, for a load
 step, the largest |w - w*| [rad/s] and the time until a tenth of it or 0.05 rad/s [ms], else its rms [mrad/s].
 """
@@ -33,7 +34,7 @@ from hil.tuning.loop import count_alarms
 from hil.tuning.optimise import Limits, law_of, tune
 
 MS, MS_WORST = 1.6, 2.2
-LAWS: Final = (("adaptive", 12.0), ("cubic", 12.0), ("ftdob", 100.0), ("cubic", 100.0), ("pi", 100.0))
+LAWS: Final = (("adaptive", 12.0), ("cubic", 18.0), ("ftdob", 100.0), ("cubic", 100.0), ("pi", 100.0))
 STEPS: Final = (0.05, 0.2, 0.5, 1.0, 2.0, 5.4)
 AT_S: Final = 2.5
 COGGING: Final = 'load=[{kind="sine", torque_n_m=0.1, frequency_hz=%.4g}]'

@@ -184,10 +184,7 @@ def cmd_compare(args: argparse.Namespace) -> int:
 def cmd_design(args: argparse.Namespace) -> int:
     """Design windows and poles."""
     one_thread()
-    from hil.report.view import show
     from hil.tuning.design import WINDOWS, Wish, design
-    from hil.tuning.page import front_picture
-    from hil.tuning.tables import design_table
 
     path = args.output
     if path is None:
@@ -203,8 +200,13 @@ def cmd_design(args: argparse.Namespace) -> int:
     )  # fmt: skip
     given = {"load": args.load, "w_noise": args.w_noise, "i_noise": args.i_noise}
     start = time.perf_counter()
-    found, best = design(args.config, overrides(args), wish, given, _spread(args.spread))
+    spread = _spread(args.spread)
+    found, best = design(args.config, overrides(args), wish, given, spread, meanwhile=_load_output)
     found["seconds"] = time.perf_counter() - start
+    from hil.report.view import show
+    from hil.tuning.page import front_picture
+    from hil.tuning.tables import design_table
+
     picture = path.with_suffix(".png")
     front_picture(found, picture)
     path.write_text(found["toml"], encoding="utf-8")
@@ -218,6 +220,14 @@ def cmd_design(args: argparse.Namespace) -> int:
     for line in found["findings"]:
         say(f"hil: {line}")
     return 0 if found.get("verified", {"ok": True})["ok"] else EXIT_FAILED
+
+
+def _load_output() -> None:
+    """Load what draws and prints a design."""
+    import matplotlib.figure  # noqa: F401
+
+    import hil.report.view
+    import hil.tuning.tables  # noqa: F401
 
 
 def _verify(args: argparse.Namespace, best: Any, given: dict[str, Any], wish: Any) -> dict[str, Any]:

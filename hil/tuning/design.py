@@ -9,7 +9,7 @@ loop of its own is commanded in A or N m; its loop and the filter of its speed a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -121,16 +121,24 @@ def _why(found: Sequence[Tuned], unit: str) -> str:
     )
 
 
+def nothing() -> None:
+    """Nothing to do meanwhile."""
+
+
 def design(
-    path: Path, overrides: Overrides, wish: Wish, given: dict[str, float | None], spread: dict[str, float]
-) -> tuple[dict[str, Any], Tuned]:
-    """Find the design and its front. Raises HilError when none keeps the limits."""
+    path: Path, overrides: Overrides, wish: Wish, given: dict[str, float | None], spread: dict[str, float],
+    meanwhile: Callable[[], None] = nothing,
+) -> tuple[dict[str, Any], Tuned]:  # fmt: skip
+    """Find the design and its front. Raises HilError when none keeps the limits.
+
+    ``meanwhile`` is called while workers search and a core is likely to be free.
+    """
     setup = speed_drive(path, overrides)
     base, own = spec_in(setup), not takes_voltage(setup)
     bench = bench_of(path, setup, given, spread=spread, shafts=wish.shafts(SEARCHED_HZ))
     limits, families = wish.limits(setup), [family(name, own) for name in wish.laws]
     with ProcessPoolExecutor() as pool:
-        best = _holding(families, bench, base, wish, limits, pool)
+        best = _holding(families, bench, base, wish, limits, pool, meanwhile)
         free = wish.aims_at_noise or "u_noise" not in best.limits_it
         at = best.verdict.u_noise if free else limits.u_noise
         budgets = [
@@ -146,7 +154,7 @@ def design(
 
 def _holding(
     families: Sequence[Family], bench: Bench, base: LawSpec, wish: Wish, limits: Limits,
-    pool: ProcessPoolExecutor,
+    pool: ProcessPoolExecutor, meanwhile: Callable[[], None],
 ) -> Tuned:  # fmt: skip
     """The best of the families, made to hold on the shafts.
 
@@ -161,6 +169,7 @@ def _holding(
             early = _best(found, noise, bench.unit)
             ahead = early, pool.submit(_on_the_shafts, early, bench, base, wish, limits)
     best = _best([job.result() for job in jobs[::-1]], noise, bench.unit)
+    meanwhile()
     if ahead and best.family is ahead[0].family:
         return ahead[1].result()
     return _on_the_shafts(best, bench, base, wish, limits)
