@@ -145,6 +145,7 @@ LAW_PARAMS: Final = np.dtype(
         ("i_d_at", "f8", POINTS),
         ("k_w2", "f8"),
         ("pair", "i8"),
+        ("jerk", "i8"),
     ],
     align=True,
 )
@@ -159,7 +160,8 @@ several, else 0, and ``span``: what an innovation rests on then, where there is 
 load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); from ``regen`` on what may go
 back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
 ``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed
-squared; ``pair``: a node's part in the law ``fac`` over two nodes (:data:`hil.control.speed.LEADS`)."""
+squared; ``pair``: a node's part in the law ``fac`` over two nodes (:data:`hil.control.speed.LEADS`);
+``jerk``: 1 when the reference's jerk is fed forward (:func:`slope_change`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -173,6 +175,7 @@ _REGEN = ("regen", "p_regen", "v_regen", "g_regen")
 _TABLED = ("points", "i_q_at", "i_d_at")
 _QUADRATIC = ("k_w2",)
 _PAIRED = ("pair",)
+_JERK = ("jerk",)
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
     (
         *_SHAPES,
@@ -187,6 +190,7 @@ LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
         *_TABLED,
         *_QUADRATIC,
         *_PAIRED,
+        *_JERK,
     ),
     0.0,
 )
@@ -244,6 +248,7 @@ LAW_STATE: Final = np.dtype(
         ("v_dc", "f8"),
         ("asked", "f8"),
         ("load", "f8"),
+        ("slope", "f8"),
     ],
     align=True,
 )
@@ -254,7 +259,7 @@ rings of what was reported and what flowed, with their newest place, and how man
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
 whether what was asked for was capped; the measured angle of the shaft, where a load over it is known, and the
 measured DC link, where it limits; the torque of a table over k_t [A]; the torque that a
-load machine was last told to give [N m]."""
+load machine was last told to give [N m]; the reference's slope in the tick before [rad/s2]."""
 
 Record = npt.NDArray[np.void]
 
@@ -709,21 +714,43 @@ def look_ahead(p: Any, s: Any) -> None:
 
 
 @jit
-def asked_current(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
+def slope_change(p: Any, s: Any, dw_ref: float) -> float:
+    """T_s w*'' [rad/s2], how the reference's slope changed over the last tick; 0 where it is not fed forward.
+
+    It is taken for how it goes on. A law asks once a tick.
+    """
+    if p["jerk"] == 0:
+        return 0.0
+    change = dw_ref - s["slope"]
+    s["slope"] = dw_ref
+    return float(change)
+
+
+@jit
+def asked_current(p: Any, s: Any, w_ref: float, dw_ref: float, change: float) -> float:
     """i_q* that moves the speed error by e^{-p_w T_s} a tick and compensates d_hat_w.
 
     w+ = a_w w + e_w (k_t i_q / J + d);  i_q* = J / (k_t e_w) (w*+ + lam (w - w*) - a_w w - e_w d)
+    with the reference of the next two ticks by its slope, and that by its ``change`` a tick.
     """
-    target = w_ref + p["T_s"] * dw_ref
-    wanted = target + p["T_s"] * dw_ref + p["lam_w"] * (s["x_p"][0] - target)
+    bend = 0.5 * p["T_s"] * change
+    target = w_ref + p["T_s"] * dw_ref + bend
+    wanted = target + p["T_s"] * (dw_ref + change) + bend + p["lam_w"] * (s["x_p"][0] - target)
     drift = p["a_w"] * s["x_p"][0] + p["e_w"] * s["d_p"][0]
     return float(p["J"] * (wanted - drift) / (p["k_t"] * p["e_w"]))
 
 
 @jit
-def speed_law(p: Any, s: Any, w_ref: float, dw_ref: float) -> float:
-    """:func:`asked_current`, limited to i_max and by what may go back to the DC link."""
-    return limited_current(p, s, s["x_p"][0], asked_current(p, s, w_ref, dw_ref))
+def lead_current(p: Any, s: Any, change: float, f: float) -> None:
+    """Let i_q be where a moving i_q* needs it, f [Wb] being the torque's constant over 1.5 n_p.
+
+    i_q* is what the next tick needs on average, the law sets i_q at its end, and i_q* moves on: with
+    D = J change / (1.5 n_p f) a tick the end is i_q* + D / 2, and i+ = i* + D / 2 + lam_q (i - (i* - D / 2)).
+    Within i_max, and not where less may go back to the DC link, or less voltage is there.
+    """
+    room = 0.0 if s["capped"] else p["i_max"] - abs(s["i_q_ref"])
+    lead = 0.5 * (1.0 + p["lam_q"]) * p["J"] * change / (1.5 * p["n_p"] * f)
+    s["u"][1] += min(max(lead, -room), room) / p["Bd"][1, 1]
 
 
 @jit
@@ -775,7 +802,7 @@ def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> Non
     tau = psi_f i_q + (L_d - L_q) i_d i_q: the speed law's q current, and what c(x_p) has already put in for
     the reluctance torque. With rows the torque is that of a table (the law ``torque``), no speed's.
     """
-    psi_f, w = p["k_t"] / (1.5 * p["n_p"]), p["n_p"] * s["x_p"][0]
+    psi_f, w, change = p["k_t"] / (1.5 * p["n_p"]), p["n_p"] * s["x_p"][0], slope_change(p, s, dw_ref)
     if p["rows"] > 0:
         if w_ref != p["w_run"]:
             s["row"] = p["rows"]
@@ -783,12 +810,14 @@ def mtpa_law(p: Any, s: Any, w_ref: float, dw_ref: float, u_limit: float) -> Non
         tau = psi_f * s["asked"]
     else:
         reluctance = (p["L_d"] - p["L_q"]) * s["x_p"][2] * s["x_p"][1]
-        tau = psi_f * asked_current(p, s, w_ref, dw_ref) + reluctance
+        tau = psi_f * asked_current(p, s, w_ref, dw_ref, change) + reluctance
     i_d_ref, i_q_ref, capped = operating_point(p, tau, w, steady_room(p, s, w, u_limit))
     s["capped"] = int(capped)
     s["i_d_ref"], s["i_q_ref"] = i_d_ref, braked(p, s, w, i_d_ref, i_q_ref) if p["regen"] else i_q_ref
     current_law(p, s)
     s["u"][2] += (1.0 - p["lam_d"]) * i_d_ref / p["Bd"][2, 2]
+    if change != 0.0:
+        lead_current(p, s, change, psi_f + (p["L_d"] - p["L_q"]) * i_d_ref)
 
 
 @jit
@@ -983,8 +1012,12 @@ def ask(p: Any, s: Any, w_ref: float, dw_ref: float, i_q_ref: float, u_limit: fl
     elif p["kind"] == MTPA:
         mtpa_law(p, s, w_ref, dw_ref, u_limit)
     else:
-        s["i_q_ref"] = speed_law(p, s, w_ref, dw_ref)
+        change = slope_change(p, s, dw_ref)
+        i_q = asked_current(p, s, w_ref, dw_ref, change)
+        s["i_q_ref"] = limited_current(p, s, s["x_p"][0], i_q)
         current_law(p, s)
+        if change != 0.0:
+            lead_current(p, s, change, p["k_t"] / (1.5 * p["n_p"]))
 
 
 @jit

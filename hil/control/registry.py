@@ -46,6 +46,10 @@ class Key:
     """Unit, where the name does not end in it."""
 
 
+JERK: Final = Key("feed the reference's jerk forward, as its slope is", False, type="flag")
+"""Of the laws that can: ``jerk_feedforward``."""
+
+
 def complete(given: Values, member: Observer | Law) -> dict[str, Any]:
     """The values that a design takes: what is given, without ``kind``, and the defaults of the rest."""
     defaults = {name: key.default for name, key in member.keys.items() if key.default is not REQUIRED}

@@ -89,13 +89,20 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     look_ahead_speed(p, s)
     a, b, kappa, T_s = p["Ad"][0, 0], p["Bd"][0, 0], p["kappa"], p["T_s"]
     drift = p["Ed"][0, 0] * s["d_hat"][0]
-    target = w_ref + (1.0 + p["delay"]) * T_s * dw_ref
-    after = target + T_s * dw_ref
+    change, ahead = 0.0, 1.0 + p["delay"]
+    if p["jerk"]:
+        change, s["slope"] = dw_ref - s["slope"], dw_ref
+    target = w_ref + ahead * T_s * (dw_ref + 0.5 * ahead * change)
+    after = target + T_s * (dw_ref + (ahead + 0.5) * change)
     holds = kappa * (after - a * target - drift) / b
     held = holds
+    if change != 0.0:  # what flows grows by D a tick, and is behind by what the command's own share is ahead
+        D = T_s * change / b
+        held -= kappa * (1.0 - p["share"]) / (1.0 - p["lag"]) * D
+        holds = held + kappa * D
     if loaded(p):
         share, lead = kappa * p["Ed"][0, 0] / b, p["cog_lead"]
-        held = holds - share * ripple(p, s, lead)
+        held -= share * ripple(p, s, lead)
         holds -= share * ripple(p, s, lead + T_s)
         drift += p["Ed"][0, 0] * ripple(p, s, lead + 0.5 * T_s)
     sigma = s["x_p"][0] + kappa * s["x_p"][1]

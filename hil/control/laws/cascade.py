@@ -8,7 +8,7 @@ import numpy as np
 
 from hil.control.composite import composite_gain
 from hil.control.linalg import exp
-from hil.control.registry import Key, Law, Plan, Values
+from hil.control.registry import JERK, Key, Law, Plan, Values
 
 CODE = 0
 KEYS = {
@@ -25,7 +25,8 @@ def design(values: Values, plan: Plan) -> dict[str, Any]:
     poles = (values["speed_pole_rad_s"], values["current_pole_rad_s"], d_pole)
     gain = composite_gain(plan.model, -np.diag(poles), np.eye(3))
     lam = dict(zip(("lam_w", "lam_q", "lam_d"), (exp(-pole * plan.T_s) for pole in poles), strict=True))
-    return {**lam, "closed": gain.closed, "Bd_inv": gain.Bd_inv}
+    jerk = int(values.get("jerk_feedforward", False))
+    return {**lam, "closed": gain.closed, "Bd_inv": gain.Bd_inv, "jerk": jerk}
 
 
-MEMBER = Law("cascade", "poles of speed and currents, disturbance compensated", CODE, design, KEYS)
+MEMBER = Law("cascade", "poles of speed and currents, disturbance compensated", CODE, design, KEYS | {"jerk_feedforward": JERK})

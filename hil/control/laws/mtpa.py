@@ -17,7 +17,7 @@ import numpy as np
 from hil.control.errors import ControlDesignError
 from hil.control.laws import cascade
 from hil.control.mtpa import POINTS
-from hil.control.registry import Key, Law, Plan, Values
+from hil.control.registry import JERK, Key, Law, Plan, Values
 
 CODE = 5
 
@@ -53,6 +53,7 @@ MEMBER = Law(
     design,
     cascade.KEYS
     | {
+        "jerk_feedforward": JERK,
         "voltage_share": Key(
             "share of the voltage circle that the steady state may take; the rest is for dynamics",
             0.92,

@@ -12,7 +12,7 @@ import numpy as np
 from hil.control.errors import ControlDesignError
 from hil.control.fac import sample
 from hil.control.linalg import exp
-from hil.control.registry import InnerLoop, Key, Law, Plan, Values
+from hil.control.registry import JERK, InnerLoop, Key, Law, Plan, Values
 from hil.control.speed import MOST_DELAY
 
 CODE = 4
@@ -48,6 +48,7 @@ def design(values: Values, plan: Plan) -> dict[str, Any]:
         "share": share,
         "kappa": kappa,
         "g_u": (1.0 - share) * b + kappa * (1.0 - lag),
+        "jerk": int(values.get("jerk_feedforward", False)),
     }
 
 
@@ -64,6 +65,6 @@ MEMBER = Law(
     "pole of the speed for a drive that takes a current or a torque, disturbance compensated",
     CODE,
     design,
-    {"speed_pole_rad_s": Key("pole of the speed error", 30.0)},
+    {"speed_pole_rad_s": Key("pole of the speed error", 30.0), "jerk_feedforward": JERK},
     ("current", "torque"),
 )
