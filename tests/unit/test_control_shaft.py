@@ -88,7 +88,7 @@ def test_margins_and_verdict_of_a_design_are_those_on_the_known_shaft() -> None:
     bench, law = bench_of(CURRENT, setup), setup.machine.law
     assert shaft is not None and bench.shafts == (shaft.elastic,) and bench.turns()[0] == shaft.elastic
     there, rigid = bench.plant(bench.motor), replace(bench, inner=replace(bench.inner, shaft=None))
-    assert len(there.b) == 4 and len(rigid.plant(bench.motor).b) == 2
+    assert len(there.b) == 5 and len(rigid.plant(bench.motor).b) == 3, "and its integral"
     assert margins(law, bench, there) != margins(law, bench, rigid.plant(bench.motor))
     assert judge(law, bench).worst.stable
 

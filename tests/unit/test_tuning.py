@@ -188,6 +188,20 @@ def test_noise_is_foretold_on_an_elastic_shaft_through_a_coarse_frame() -> None:
         assert measured == pytest.approx(linearised, rel=0.08), j
 
 
+def test_the_adaptive_design_of_the_theory_page_keeps_its_goal() -> None:
+    """2.3 rad/s and 25 ms of the fixed windows for 100 mV, at 12 mV, linear and in the simulation."""
+    window = {"kind": "adaptive", "delay_ms": 49.0, "first_ms": 3.0, "w_noise_rad_s": 0.01041}
+    window |= {"i_noise_a": 0.003512}
+    own = {"controller": {"kind": "cascade", "speed_pole_rad_s": 202.5, "current_pole_rad_s": 592.1}}
+    own |= {"speed": window | {"short_ms": 20.0}, "current": window | {"short_ms": 18.0}}
+    setup = load_setup(RIGID, Overrides(settings=settings_of(own)))
+    found = judge(setup.machine.law, bench_of(RIGID, setup))
+    assert found.u_noise <= 0.012 and found.nominal.dip < 2.3 and found.nominal.recovery_ms < 25
+    assert found.nominal.ms < 1.6 and found.worst.ms < 2.2, "stable in every corner, short and long"
+    seen = seen_in(simulate_ticks(setup), 1e-3)
+    assert mean_noise(setup, [], seen, 1e-3) <= 0.012 and seen.dip < 2.3 and seen.recovery_ms < 25
+
+
 def test_noise_that_comes_in_bursts_is_foretold() -> None:
     """In one corner i_d now stays within the middle step of its frame and now swings out of it."""
     window = {"kind": "adaptive", "delay_ms": 33.0, "first_ms": 3.0, "w_noise_rad_s": 0.01041}

@@ -29,4 +29,10 @@ def design(values: Values, plan: Plan) -> dict[str, Any]:
     return {**lam, "closed": gain.closed, "Bd_inv": gain.Bd_inv, "jerk": jerk}
 
 
-MEMBER = Law("cascade", "poles of speed and currents, disturbance compensated", CODE, design, KEYS | {"jerk_feedforward": JERK})
+MEMBER = Law(
+    "cascade",
+    "poles of speed and currents, disturbance compensated",
+    CODE,
+    design,
+    KEYS | {"jerk_feedforward": JERK},
+)
