@@ -37,6 +37,8 @@ CHECKED_HZ: Final = 24
 SEARCHED_HZ: Final = 8
 SHAFT_REPAIRS: Final = 3
 CHECK_S: Final = 4.0
+AMPLIFIES: Final = 1.05
+"""Peak |H| past which a window is one with a lead; of the others it is 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +150,19 @@ def design(
         front = [best, *(job.result() for job in jobs)]
     spec = spec_of(best.tables, base)
     found = _result(best, front, spec, bench, np.array(lsb_of(setup)))
-    found |= {"config": str(path), "wish": asdict(wish), "findings": findings_of(setup)}
+    findings = [*findings_of(setup), *leading(found["windows"])]
+    found |= {"config": str(path), "wish": asdict(wish), "findings": findings}
     return found, best
+
+
+def leading(windows: dict[str, dict[str, float]]) -> list[str]:
+    """What is said of windows that amplify: they are tried only when they are named."""
+    return [
+        f"{name} window: peak |H| {own['peak_H']:.2f}: it amplifies noise and what is wrong in the model, "
+        "so it is opt-in (--law); it was judged with the spread that was given, and bears little more"
+        for name, own in windows.items()
+        if own["peak_H"] > AMPLIFIES
+    ]
 
 
 def _holding(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
+from hil.control.registry import observers
 from hil.errors import HilError
 from hil.tuning.measure import Bench
 
@@ -245,6 +246,11 @@ def family(name: str, own_loop: bool = False) -> Family:
     if law in FAMILIES:
         raise HilError(
             f"--laws: {law} is not for a drive with a current loop of its own; there are {', '.join(known)}"
+        )
+    if law in observers():
+        raise HilError(
+            f"--laws: {law} is a window that a configuration names (observer.speed.kind), none that is "
+            f"tuned; there are {', '.join(known)}"
         )
     raise HilError(f"--laws: no law {name!r}; there are {', '.join(known)}")
 

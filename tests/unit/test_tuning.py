@@ -395,6 +395,22 @@ def test_what_the_shipped_configs_promise() -> None:
     assert seen_in(simulate_ticks(rigid_one), 1e-3).dip < 2.3
 
 
+def test_a_window_with_a_lead_is_said_to_be_opt_in(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its peak of |H| is 1.5 and more; with the usual spread no design of it keeps the limits."""
+    args = ["design", str(DEMO), "--effort", "0.1", "-o", str(tmp_path / "a.toml"), "--json", "--law"]
+    assert main([*args, "ramp-exact", "--spread", "0.1"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    said = [line for line in found["findings"] if line.startswith("speed window: peak |H|")]
+    assert len(said) == 1 == len(found["findings"]) and "opt-in" in said[0]
+    assert found["windows"]["speed"]["peak_h"] > 1.5
+    assert main([*args, "ramp-exact"]) == 2
+    assert "no design keeps these limits" in capsys.readouterr().err
+    assert main([*args, "harmonic-exact"]) == 2
+    assert "observer.speed.kind" in capsys.readouterr().err
+
+
 @pytest.mark.process
 def test_a_design_is_verified_in_simulation_and_on_the_bus(tmp_path: Path) -> None:
     """Of the 18 plants the two that need no corner; the corners differ from them by a setting."""
