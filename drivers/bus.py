@@ -25,6 +25,7 @@ from drivers.local import (
     RTR_FLAG,
     LocalBus,
     check_length,
+    hear_only,
     keep_out,
     pack_frame,
 )
@@ -115,7 +116,13 @@ class SocketLink:
             raise_link_error(error, "send")
 
     def hear(self, ids: Collection[int], only: bool = True) -> None:
-        """Receive frames of these identifiers, with flags, alone; without ``only`` all but those."""
+        """Receive frames of these identifiers, with flags, alone; without ``only`` all but those.
+
+        Of none: of a link that only sends, which then costs those who send nothing either.
+        """
+        if only and self.receiving.family == socket.AF_CAN:
+            hear_only(self.receiving, ids)
+            return
         udp = self.receiving.family == socket.AF_INET
         keep_out(self.receiving, self.sending.getsockname()[1] if udp else None, ids, only)
 

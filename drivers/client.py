@@ -283,6 +283,8 @@ class DriveClient:
 
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
+        if code := self._begun(EXCHANGED):
+            self._conclude(code, 0)
         self._cells[_GOT] = 0
         self._take_late(tick)
         self._send_sync()

@@ -75,6 +75,18 @@ def keep_out(sock: socket.socket, port: int | None, ids: Collection[int] = (), o
     sock.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, program)
 
 
+def hear_only(receiving: socket.socket, ids: Collection[int]) -> None:
+    """Let a raw CAN socket hear these identifiers, with flags, and errors.
+
+    The kernel finds who hears an identifier before it makes a copy of the frame: what is not heard costs its
+    sender nothing, where a program of :func:`keep_out` costs a copy.
+    """
+    known = [(can_id, EFF_FLAG | RTR_FLAG | (0x1FFFFFFF if can_id & EFF_FLAG else 0x7FF)) for can_id in ids]
+    receiving.setsockopt(
+        socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"".join(struct.pack("=II", *one) for one in known)
+    )
+
+
 def _as_loaded(can_id: int) -> int:
     """An identifier as the program sees it: a frame has it in the processor's order, a load is big endian."""
     return int.from_bytes(struct.pack("=I", can_id), "big")

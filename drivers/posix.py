@@ -234,12 +234,19 @@ def rest(raw: Any) -> None:
 
 @waiting
 def exchange(places: Any, size: int, deadline_ns: int) -> Any:
-    """Take what waits as late, send SYNC with its counter and :func:`drain`; PENDING where SYNC must wait.
+    """:func:`opened`, then :func:`drain`, whose codes it returns once SYNC was sent."""
+    code = opened(places, size)
+    return drain(places, deadline_ns, False) if code == DONE else code
+
+
+@jit
+def opened(places: Any, size: int) -> Any:
+    """Take what waits as late and send SYNC with its counter; PENDING where SYNC must wait.
 
     A command that the drive answers stands in SYNC's place, the frame that says off behind it.
 
     It waits for flags to be told, a bus that was down, and what can't be judged of the late frames, which is
-    in ``IO`` at LATE then. Returns what :func:`drain` does, or UNSENT - errno when SYNC was not sent.
+    in ``IO`` at LATE then. Returns DONE, or UNSENT - errno when SYNC was not sent.
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
     state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
@@ -258,7 +265,7 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     note(log, s, raw, 0, now_ns(times))
     code = transmit(fds, raw, size, state, log)
     rest(raw)
-    return drain(places, deadline_ns, False) if code == DONE else UNSENT + code
+    return DONE if code == DONE else UNSENT + code
 
 
 @jit

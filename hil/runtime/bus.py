@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from drivers.bcm import KernelSync, kernel_sync
-from drivers.bus import BusSettings, Link, open_link
+from drivers.bus import BusSettings, Link, SocketLink, open_link
 from drivers.busload import frame_seconds
 from drivers.codec import Database
 from drivers.drive import Drive as BusDrive
@@ -125,11 +125,12 @@ def new_client(
     on_frames: OnFrames | None = None,
     now: Callable[[], int] = time.monotonic_ns,
     controls: bool = False,
+    hears: bool = True,
 ) -> BusDrive:
     """A drive client on a link of its own; one that ``controls`` may have SYNC by the kernel."""
     load = setup.config.commands_load
     return drive_kind(setup.config.drive.kind).open(
-        opened_link(setup),
+        opened_link(setup) if hears else deaf(opened_link(setup)),
         setup.database,
         load=load,
         drive_map=setup.binding.map,
@@ -145,6 +146,13 @@ def opened_link(setup: Setup) -> Link:
     if setup.config.loop.clock == "lockstep":
         sync = setup.binding.opener
         link = LockstepLink(link, sync.send_id if sync else None)
+    return link
+
+
+def deaf(link: Link) -> Link:
+    """A link that only sends: where it has a socket it hears nothing from now on."""
+    if isinstance(link, SocketLink):
+        link.hear(())
     return link
 
 

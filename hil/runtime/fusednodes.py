@@ -2,8 +2,8 @@
 
 Like :mod:`hil.runtime.fused`, of whose pieces it is made, it has no rules of its own, and at the first thing
 that is unusual it returns the stage that it reached; the pace says how many steps of it are done. Each node
-has a table as :func:`hil.runtime.fused.table_of` makes it, with what it keeps of its controller's state
-behind it.
+has a table as :func:`hil.runtime.fused.table_of` makes it, with what is kept of its controller's states
+behind it: :mod:`hil.tick.undo`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Final
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
@@ -28,7 +27,7 @@ from drivers.posix import (
     STATES,
     command,
     drain,
-    exchange,
+    opened,
 )
 from drivers.wire import STATE
 from hil.control.law import LAW_PARAMS
@@ -63,26 +62,23 @@ from hil.runtime.fused import (
 from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, beats, guardian_flags
 from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, timing_of
 from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
-from hil.runtime.rules import DID, NEWS, PLANNED, SYNC_BYTES, Pace, begin, since, stamp
+from hil.runtime.rules import DID, FRESH, NEWS, NO_WAIT, PLANNED, SYNC_BYTES, Pace, begin, since, stamp
 from hil.runtime.trouble import TROUBLE
 from hil.signals import TICK
 from hil.tick.kernel import PLACED, whole_at
 from hil.tick.pair import ask, leads
 from hil.tick.pair import tell as tell_load
+from hil.tick.undo import keep
 
 KEPT, NODES, NODE_ROWS = ROWS, ROWS + 1, ROWS + 2
-"""Behind a node's table: the places of its controller's states, then of what is kept of them; behind the
-first's that of the nodes' tables, too."""
-ADDRESS, LENGTH = 0, 1
+"""Behind a node's table: the places of what is kept of its controller's states; behind the first's that of
+the nodes' tables, too."""
 LAW_AT: Final = PLACED.index(LAW_PARAMS)
 QUIET, STOPPED, ENDS = ALONE
 PARTS: Final = sys.modules[__name__]
 """As :data:`hil.runtime.fused.PARTS`; these are as there, of the first node."""
 sleep, now, until, asked = fused.sleep, fused.now, fused.until, fused.asked
 receive, synced = fused.receive, fused.synced
-U1: Final = np.dtype(np.uint8)
-_word: Any = numba.types.uintp
-_memcpy: Any = numba.types.ExternalFunction("memcpy", _word(_word, _word, _word))
 
 
 def whole_nodes(
@@ -106,8 +102,8 @@ def whole_nodes(
         own += recorder.places(port.log, place)
         timing = timing_of(plan, False, port.sync_bytes)
         table, held = table_of(own, timing, axis.ticks, words, request, pace, number, marks)
-        kept = np.array([place_of(array, U1) for array in axis.states()])
-        tables.append(np.concatenate([table, [place_of(kept.reshape(-1), I8), (0, 0)]]))
+        kept = axis.undo.places.reshape(-1)
+        tables.append(np.concatenate([table, [place_of(kept, I8), (0, 0)]]))
         alive += [held, kept]
     nodes = np.array([place_of(table.reshape(-1), I8) for table in tables])
     tables[0][NODES] = place_of(nodes.reshape(-1), I8)
@@ -206,16 +202,16 @@ def sync(table: Any, _t: Any, until_ns: int) -> Any:
         if take_late(places_at(nodes, i)) != DONE:
             return False
         pace[DID] += 1
-    size = array_at(table, PLAN, I8)[SYNC_BYTES]
-    for i in range(len(nodes)):
-        one = places_at(nodes, i)
-        places = places_at(one, RECEIVE)
-        code = exchange(places, size, until_ns) if i == 0 else drain(places, until_ns, False)
-        if code != DONE:
-            if code != PENDING or i > 0:
-                io_of(one, RECEIVE)[EXCHANGED] = code
+    code = opened(places_at(table, RECEIVE), array_at(table, PLAN, I8)[SYNC_BYTES])
+    if code != DONE:
+        if code != PENDING:
+            io_of(table, RECEIVE)[EXCHANGED] = code
+        return False
+    hand_on(table)
+    pace[DID] += 1
+    for i in range(len(nodes) - 1, -1, -1):
+        if listen(places_at(nodes, i), until_ns, i == len(nodes) - 1) != DONE:
             return False
-        hand_on(one)
         pace[DID] += 1
     if len(words) > 0:
         for i in range(len(nodes)):
@@ -225,12 +221,18 @@ def sync(table: Any, _t: Any, until_ns: int) -> Any:
 
 
 @jit
-def keep(table: Any) -> None:
-    """Keep the controller's states, to which its tick may have to go back."""
-    places = places_at(table, KEPT)
-    count = len(places) // 2
-    for i in range(count):
-        _memcpy(places[count + i, ADDRESS], places[i, ADDRESS], places[i, LENGTH])
+def listen(table: Any, until_ns: int, first: bool) -> Any:
+    """A node's feedback; but for the ``first`` that is listened to it is there already. As drain returns."""
+    places, code = places_at(table, RECEIVE), DONE
+    if not first:
+        code = drain(places, NO_WAIT, False)
+    if code == DONE and tick_of(table)["rx_flags"] & FRESH == 0:
+        code = drain(places, until_ns, False)
+    if code != DONE:
+        io_of(table, RECEIVE)[EXCHANGED] = code
+        return code
+    hand_on(table)
+    return code
 
 
 @jit
@@ -272,7 +274,7 @@ def law(table: Any, t: Any) -> Any:
         one = places_at(nodes, i)
         ticks = array_at(one, TICK_AT, TICK)
         state, before = ticks[0]["state"], ticks[0]["reason"]
-        keep(one)
+        keep(places_at(one, KEPT), ticks[0]["gap"])
         whole_at(places_at(one, LAW), ticks)
         reason = ticks[0]["reason"]
         left |= reason not in (QUIET, STOPPED, ENDS)

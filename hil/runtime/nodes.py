@@ -12,9 +12,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final, Protocol
 
-import numpy as np
-import numpy.typing as npt
-
 from hil.config.design import Machine
 from hil.log.recorder import Recorder
 from hil.ports import Clock, Inbox
@@ -34,6 +31,7 @@ from hil.runtime.loop import (
 from hil.runtime.rules import DID, Fields, Pace, begin, since, stamp
 from hil.signals import Reason, Request, TickArray
 from hil.tick.pair import ask, leads, tell
+from hil.tick.undo import Undo
 
 COUNTERS: Final = GUARD_NS + 1
 """Word of the first node's newest command counter; those of the others follow."""
@@ -50,8 +48,8 @@ class Client(Protocol):
     def prepare(self, tick: Any) -> None:
         """Get ready for this very record."""
 
-    def exchange(self, tick: Any, deadline_ns: int) -> None:
-        """Send SYNC, for all nodes, then :meth:`receive`; what came before is taken as late."""
+    def sync(self, tick: Any) -> None:
+        """Send SYNC, for all nodes; what came before is taken as late."""
 
     def follow(self, tick: Any) -> None:
         """Take what came before another client's SYNC as late."""
@@ -87,19 +85,13 @@ class Axis:
         self.t = Fields(ticks)
         self.step = machine.looped()
         self.outcome = Outcome()
-        own = (machine.safety_state, machine.law_state, machine.setpoint_state)
-        self._live = [state.view(np.uint8) for state in own]
-        self._kept = [live.copy() for live in self._live]
+        states = (machine.safety_state, machine.law_state, machine.setpoint_state)
+        self.undo = Undo(machine.safety, machine.law, states)
         client.prepare(self.tick)
-
-    def states(self) -> list[npt.NDArray[np.uint8]]:
-        """Bytes of its controller's states, then of what :meth:`decide` keeps of them."""
-        return [*self._live, *self._kept]
 
     def decide(self) -> bool:
         """Run the controller; True when the others must stop with it."""
-        for kept, live in zip(self._kept, self._live, strict=True):
-            kept[:] = live
+        self.undo.keep()
         self.step(self.ticks)
         return self.t["reason"] not in ALONE
 
@@ -107,8 +99,7 @@ class Axis:
         """The same tick once more for a node that has no reason of its own: another one has."""
         if self.t["reason"]:
             return
-        for kept, live in zip(self._kept, self._live, strict=True):
-            live[:] = kept
+        self.undo.restore()
         self.t["request"] = NODE_STOPPED
         self.step(self.ticks)
 
@@ -125,12 +116,13 @@ class Together:
     def exchange(self, tick: Any, deadline_ns: int, did: int = 0) -> None:
         """SYNC once, then each node's feedback; nothing is sent once the guardian has fired.
 
+        The last node is waited for first: its answer is the last on the bus, and the others' are there then.
         ``did``: how many of these steps a compiled tick has done: what came late of each node after the
-        first, SYNC with the first's feedback, the others' feedback.
+        first, SYNC, the feedback of each.
         """
         first, *more = self._axes
-        steps = [*(partial(self.late, axis) for axis in more), partial(self.open, first, deadline_ns)]
-        steps += [partial(self.listen, axis, deadline_ns) for axis in more]
+        steps = [*(partial(self.late, axis) for axis in more), partial(self.open, first)]
+        steps += [partial(self.listen, axis, deadline_ns) for axis in reversed(self._axes)]
         for step in steps[did:]:
             step()
 
@@ -140,13 +132,12 @@ class Together:
         axis.client.follow(axis.tick)
         axis.client.flush()
 
-    def open(self, axis: Axis, deadline_ns: int) -> None:
-        """SYNC and the node's feedback."""
+    def open(self, axis: Axis) -> None:
+        """SYNC, after what came late of its node."""
         if self._words is not None and self._words[FIRED]:
             axis.client.follow(axis.tick)
-            axis.client.receive(axis.tick, deadline_ns)
         else:
-            axis.client.exchange(axis.tick, deadline_ns)
+            axis.client.sync(axis.tick)
         axis.client.flush()
 
     def receive(self, tick: Any, deadline_ns: int) -> None:

@@ -18,7 +18,7 @@ from hil.config.design import Machine
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder, check_folder
 from hil.runtime import fused, fusednodes
-from hil.runtime.bus import opened_link
+from hil.runtime.bus import deaf, opened_link
 from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import Words
 from hil.runtime.header import header_of, log_path
@@ -78,12 +78,15 @@ def _said_of(name: str) -> Iterator[None]:
         raise ArmingError(f"node {name}: {error}") from error
 
 
-def _clients(setups: Nodes, recorder: Recorder | None, clock: Clock | None) -> list[DriveClient]:
-    """A client for each node on one link."""
+def _clients(
+    setups: Nodes, recorder: Recorder | None = None, clock: Clock | None = None
+) -> list[DriveClient]:
+    """A client for each node; without a clock they only send."""
     first = next(iter(setups.values()))
     links = links_of(partial(opened_link, first), [setup.binding for setup in setups.values()])
     on_frames = recorder.frames if recorder and first.config.log.frames else None
     now = clock.now_ns if clock else time.monotonic_ns
+    links = links if clock else [deaf(link) for link in links]
     return [
         DriveClient(port, one.database, on_frames=on_frames, now=now, drive_map=one.binding.map)
         for port, one in zip(links, setups.values(), strict=True)
@@ -104,7 +107,7 @@ class Stopper:
 
 def _stopper(setups: Nodes, words: Words) -> Stopper:
     """With clients of its own."""
-    return Stopper(_clients(setups, None, None), words.cells)
+    return Stopper(_clients(setups), words.cells)
 
 
 def _recorded(

@@ -103,7 +103,7 @@ def run(setup: Setup, *, arm: bool = False, request: StopRequest | None = None) 
     with alone(setup), writing(Recorder(path, None, config.loop.rate_hz)) as recorder:
         compile_kernels(setup)  # while the writer starts
         check_set_up(setup)
-        with guarding(config, recorder, partial(new_client, setup)) as words:
+        with guarding(config, recorder, partial(new_client, setup, hears=False)) as words:
             return _recorded(setup, request, recorder, clock, words)
 
 

@@ -30,6 +30,7 @@ from hil.control.law import ask, new_law_state
 from hil.errors import ConfigError
 from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
+from hil.runtime.bus import deaf
 from hil.runtime.nodes import Together
 from hil.runtime.nodesetup import load_node_setups, nodes_load
 from hil.runtime.refusals import load_found
@@ -336,6 +337,19 @@ def hub_of(*frames: tuple[int, int]) -> tuple[Hub, Listened]:
     return Hub(link, [setup.binding for setup in setups_of().values()]), link
 
 
+def test_a_guardian_s_link_sends_and_hears_nothing() -> None:
+    """Whose frames nobody reads need no copy for each, which who sends them would pay for."""
+    bus = BusSettings("hil-local", f"deaf-{os.getpid()}")
+    other, link = open_link(bus), deaf(open_link(bus))
+    other.send(0x181, bytes(8))
+    link.send(0x201, b"\x06")
+    heard = other.receive(1_000_000_000)
+    assert heard is not None and (heard.can_id, heard.data) == (0x201, b"\x06")
+    assert link.receive(50_000_000) is None
+    link.close()
+    other.close()
+
+
 def test_each_client_gets_what_its_drive_sends() -> None:
     """In order, each once; what is nobody's and a foreign command go where they are judged, errors to all."""
     hub, link = hub_of(
@@ -411,7 +425,8 @@ def test_what_came_late_is_logged_before_the_next_sync() -> None:
     clients = [SimpleNamespace(client=Noted(name), tick=None) for name in ("motor", "load")]
     Together(clients, None).exchange(None, 0)  # type: ignore[arg-type]
     assert did == [
-        "load follow", "load flush", "motor exchange", "motor flush", "load receive", "load flush",
+        "load follow", "load flush", "motor sync", "motor flush", "load receive", "load flush",
+        "motor receive", "motor flush",
     ]  # fmt: skip
 
 

@@ -1,7 +1,8 @@
 """`python -m tests.vm.instructions`: instructions a tick in the bench machine, by phase, against the budget.
 
 The loop's thread alone is counted, in virtual time (one instruction, one nanosecond): on vcan0, the Kvaser
-pair and 64-byte frames, where the bare loop of the same boot is the floor, and with each shipped drive.
+pair and 64-byte frames, where the bare loop of the same boot is the floor, with each shipped drive, and with
+one CiA 402 node and two.
 `--update` writes the budget anew: what was measured and 3 percent. The budget is in `budget.toml` and nowhere
 else.
 """
@@ -20,6 +21,7 @@ from tests.vm.machine import MachineError, run_in_machine
 
 BUDGET = Path(__file__).resolve().parent / "budget.toml"
 ROOM = 1.03
+LEFT = ("instructions.json", "nodes.json")
 Counted = dict[str, Any]
 """What `tests/vm/guest/instructions.py` leaves."""
 
@@ -28,20 +30,19 @@ def boot(timeout_s: float) -> Counted:
     """Count in a machine of its own. Raises MachineError."""
     with tempfile.TemporaryDirectory(prefix="hil-instructions-") as folder:
         result = run_in_machine(
-            ["python", "tests/vm/guest/suite.py", "rehearsal", "instructions"],
+            ["python", "tests/vm/guest/suite.py", "rehearsal", "instructions", "two_nodes"],
             timeout_s=timeout_s,
             out=Path(folder),
         )
-        left = Path(folder) / "instructions.json"
-        if not left.is_file():
-            raise MachineError(f"nothing was counted: {result.stdout[-2000:]}{result.stderr[-2000:]}")
-        return read(left)
+        if not all((Path(folder) / name).is_file() for name in LEFT):
+            raise MachineError(f"not all was counted: {result.stdout[-2000:]}{result.stderr[-2000:]}")
+        return read(Path(folder))
 
 
-def read(path: Path) -> Counted:
-    """What one boot counted."""
-    counted: Counted = json.loads(path.read_text())
-    return counted
+def read(folder: Path) -> Counted:
+    """What one boot counted: each drive and bus, then one node and two."""
+    counted, nodes = (json.loads((folder / name).read_text()) for name in LEFT)
+    return counted | {"buses": counted["buses"] | nodes}
 
 
 def budget() -> dict[str, dict[str, float]]:

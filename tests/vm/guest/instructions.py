@@ -5,6 +5,9 @@ loop against the same drive as the floor. A stall of the machine only adds, so t
 processor time is read, so that waiting counts for nothing. Leaves $OUT/instructions.json.
 
 For each shipped drive: three plain runs of its configuration, and the log of the one that counts.
+
+For a CiA 402 node and for two the same, of `configs/dyno.toml` against
+:mod:`tests.vm.guest.responder`. Leaves $OUT/nodes.json.
 """
 
 from __future__ import annotations
@@ -22,9 +25,11 @@ from hil import cli
 from hil.bench.meter import run_metered
 from hil.bench.pieces import guard_ns
 from hil.config.tables import RunConfig, load_toml
+from tests.vm.guest import responder
 from tests.vm.guest.process import CONFIG, FD, KERNEL, SCRATCH, Forked
 
 SECONDS = 0.5
+RUNS = ("first", "second", "third")
 ATTEMPTS = 3
 """A stall of the whole machine can end a run; a count is of a run that went to its end."""
 BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
@@ -39,6 +44,10 @@ BUSES: dict[str, tuple[str, str, tuple[str, ...], tuple[str, ...]]] = {
 
 DRIVES = ("current", "cia402", "moteus", "odrive")
 """configs/NAME.toml."""
+NODES = {"node": (5,), "nodes": (5, 6)}
+"""The motor of configs/dyno.toml, and both."""
+NODES_SECONDS = 2.0
+"""Longer, since both arm, start and stop in Python, which is no tick's cost, and two twice."""
 CALM = ("load=[]", "truth=false")
 
 
@@ -61,6 +70,32 @@ def run_bare(interface: str, dbc: Path, ticks: int, priority: int, by_kernel: bo
     can_id = database.message("SYNC").send_id
     all_but(sockets[0], can_id)
     return bare_answers(sockets, frames, kernel_sync(interface, can_id, True, period_ns), ticks) * 1e3
+
+
+def result(name: str, job: Callable[[], int], out: Path) -> str:
+    """What a process of its own printed, once it went to its end."""
+    for _ in range(ATTEMPTS):
+        if (code := Forked(out, job).wait()) == 0:
+            return out.read_text()
+        sys.stderr.write(f"{name}: {out.name} ended with {code}: {out.read_text()[:300]}\n")
+    raise RuntimeError(f"{name}: {out.name} ended with {code}: {out.read_text()[:300]}")
+
+
+def without(text: str, *tables: str) -> str:
+    """A configuration without these tables."""
+    parts = text.split("\n[")
+    return "\n[".join(part for part in parts if not part.startswith(tables))
+
+
+def nodes_config(folder: Path) -> Path:
+    """`configs/dyno.toml` for nodes that are set up, with nothing that an emulator alone has."""
+    text = without(
+        Path("configs/dyno.toml").read_text(), "drive.canopen", "drive.emulator", "drive.signals.units"
+    )
+    lines = [line for line in text.splitlines() if not line.startswith("load_true")]
+    path = folder / "nodes.toml"
+    path.write_text("\n".join(lines).replace("drives/", f"{Path('configs/drives').resolve()}/"))
+    return path
 
 
 class Bus:
@@ -87,13 +122,8 @@ class Bus:
         return ["run", self.config, *self.words(self.own), "--json", *arm, *flags("--set", *more)]
 
     def result(self, job: Callable[[], int], name: str) -> str:
-        """What a process of its own printed, once it went to its end."""
-        out = self.folder / name
-        for _ in range(ATTEMPTS):
-            if (code := Forked(out, job).wait()) == 0:
-                return out.read_text()
-            sys.stderr.write(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}\n")
-        raise RuntimeError(f"{self.name}: {name} ended with {code}: {out.read_text()[:300]}")
+        """:func:`result` of a job of this bus."""
+        return result(self.name, job, self.folder / name)
 
     def run(self, name: str) -> dict[str, Any]:
         """What a plain run says of itself."""
@@ -123,7 +153,7 @@ class Bus:
     def measure(self) -> dict[str, Any]:
         self.emulator.until("ready")
         try:
-            runs = [self.plain(name) for name in ("first", "second", "third")]
+            runs = [self.plain(name) for name in RUNS]
             phases = min((self.phases() for _ in range(2)), key=lambda found: sum(found.values()))
             return {"runs": sorted(runs), "phases": phases, "bare": self.bare()}
         finally:
@@ -137,13 +167,42 @@ class Bus:
             if self.name == "cia402":  # it has forgotten its mapping while it was off
                 words = ["configure", self.config, *self.words(self.own), "--json"]
                 self.result(lambda: cli.main(words), "configured")
-            said = [self.run(name) for name in ("first", "second", "third")]
+            said = [self.run(name) for name in RUNS]
             counted = min(said, key=lambda one: float(one["processor_us"]))
             shutil.copy(counted["log"], out / f"{self.name}.mcap")
             return {"runs": sorted(float(one["processor_us"]) * 1e3 for one in said), "said": counted}
         finally:
             self.emulator.send_signal(signal.SIGTERM)
             self.emulator.wait()
+
+
+def count_nodes(out: Path) -> None:
+    """:data:`NODES` to $OUT/nodes.json."""
+    found = {name: measure_nodes(name, out) for name in NODES}
+    (out / "nodes.json").write_text(json.dumps(found))
+
+
+def measure_nodes(name: str, out: Path) -> dict[str, Any]:
+    """One node or two of :data:`NODES`: three plain runs, and the log of the one that counts."""
+    folder = SCRATCH / f"instructions-{name}"
+    folder.mkdir()
+    path, ids = nodes_config(folder), NODES[name]
+    dbc = Path("configs/drives/cia402.dbc")
+    peer = Forked(folder / "peer.txt", lambda: responder.serve("vcan0", dbc, *ids))
+    peer.until("ready")
+    chosen = ['node="motor"'] if len(ids) == 1 else []
+    settings = (f'log.folder="{folder}"', f"loop.duration_s={NODES_SECONDS}", "feedback.hold_ticks=20",
+                "drive.0.reference.w_rad_s=0.0")  # fmt: skip
+    words = ["run", str(path), "-i", "socketcan", "-c", "vcan0", "--json"]
+    words += flags("--set", *settings, *chosen)
+    try:
+        said = [json.loads(result(name, lambda: cli.main(words), folder / run)) for run in RUNS]
+    finally:
+        peer.send_signal(signal.SIGTERM)
+        peer.wait()
+    counted = min(said, key=lambda one: float(one["processor_us"]))
+    shutil.copy(counted["log"], out / f"{name}.mcap")
+    return {"runs": sorted(float(one["processor_us"]) * 1e3 for one in said), "said": counted}
 
 
 def measure(out: Path) -> None:

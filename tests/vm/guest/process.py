@@ -91,11 +91,17 @@ def warm_up() -> None:
 def compile_the_rest() -> None:
     """On the host: kernels that single jobs need, so that the machine finds them compiled."""
     from hil.bench.pieces import guard_ns
+    from hil.runtime import fusednodes
+    from hil.runtime.nodesetup import load_node_setups
     from hil.runtime.session import compile_kernels
     from hil.runtime.setup import Overrides, load_setup
 
     guard_ns(load_setup(Path(CONFIG), Overrides()).machine, 1)
     own_bus = ['bus.interface="hil-local"']
+    fusednodes.load()
+    nodes = load_node_setups(Path("configs/dyno.toml"), Overrides())
+    for setup in (nodes or {}).values():
+        compile_kernels(setup)
     for name in SHIPPED:
         path = Path(f"configs/{name}.toml")
         compile_kernels(load_setup(path, Overrides()))

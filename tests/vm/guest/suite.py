@@ -516,6 +516,11 @@ def instructions() -> None:
     counted.measure(OUT)
 
 
+def two_nodes() -> None:
+    """What a tick of two nodes costs beside that of one."""
+    counted.count_nodes(OUT)
+
+
 def main() -> int:
     scenarios: list[Callable[[], None]] = [
         rehearsal,
@@ -553,6 +558,7 @@ def main() -> int:
         stranger_cia402,
         stranger_joint,
         instructions,
+        two_nodes,
     ]
     wanted = sys.argv[1:]
     begin = time.monotonic()
