@@ -25,13 +25,12 @@ Rings = Mapping[str, tuple[int, int, int]]
 """By the field's name: kind, entries in the ring, entries that a usual tick may write."""
 WHOLE, FIXED, HEAD, PLACE, COUNTER, STARTS = range(6)
 """Of ``starts``: 1 when all was kept, then by the kind of a part the first entry that was."""
-WORDS, COUNT, KIND, ENTRIES, COLUMNS = range(5)
-"""Of a part: words of an entry, entries in the ring, kind, entries that are kept."""
-STARTS_AT, SAFETY_AT, LAW_AT, USUAL, ALL, PARTS = range(6)
-"""Of an undo's places: rows (:data:`WORDS`) of the parts that a usual tick writes, and of all; behind them
-the places of each, of the state's and of what is kept of it."""
+FROM, TO, SIZE, COUNT, KIND, ENTRIES, COLUMNS = range(7)
+"""Of a part: addresses of the state's and of what is kept of it, bytes of an entry, entries in the ring,
+kind, entries that are kept."""
+STARTS_AT, SAFETY_AT, LAW_AT, USUAL, ALL = range(5)
+"""Of an undo's places: rows of the parts that a usual tick writes, and of all."""
 I8: Final = np.dtype(np.int64)
-BYTES: Final = I8.itemsize
 _word: Any = numba.types.uintp
 _memcpy: Any = numba.types.ExternalFunction("memcpy", _word(_word, _word, _word))
 
@@ -44,14 +43,10 @@ class Part(NamedTuple):
     kind: int
     entries: int
 
-    def places(self) -> list[tuple[int, int]]:
-        """For :func:`keep`."""
-        return [place_of(self.live.reshape(-1).view(I8), I8), place_of(self.kept.reshape(-1).view(I8), I8)]
-
     def row(self) -> list[int]:
-        """For :func:`keep`, too."""
+        """For :func:`keep`."""
         count, size = self.live.shape
-        return [size // BYTES, count, self.kind, self.entries]
+        return [self.live.ctypes.data, self.kept.ctypes.data, size, count, self.kind, self.entries]
 
 
 def parts_of(live: Bytes, kept: Bytes, dtype: np.dtype[np.void], rings: Rings) -> Iterator[Part]:
@@ -95,7 +90,6 @@ class Undo:
         self._rows = [np.array([part.row() for part in parts], np.int64).reshape(-1) for parts in both]
         own = [place_of(self._starts, I8), place_of(states[0], SAFETY_STATE), place_of(states[1], LAW_STATE)]
         own += [place_of(rows, I8) for rows in self._rows]
-        own += [place for parts in both for part in parts for place in part.places()]
         self.places = np.array(own, np.int64)
         """For :func:`keep`; they must not outlive this."""
 
@@ -120,15 +114,9 @@ def keep(places: Any, gap: int) -> None:
     usual = gap == 1 and law["gap"] == 0 and law["filled"] > 0
     starts[WHOLE] = 0 if usual else 1
     starts[HEAD], starts[PLACE], starts[COUNTER] = law["head"] + 1, law["place"], safety["counter"]
-    rows, at = array_at(places, USUAL if usual else ALL, I8), PARTS
-    if not usual:
-        at += 2 * (len(array_at(places, USUAL, I8)) // COLUMNS)
-    for i in range(len(rows) // COLUMNS):
-        live, kept = array_at(places, at + 2 * i, I8), array_at(places, at + 2 * i + 1, I8)
-        row = rows[COLUMNS * i : COLUMNS * (i + 1)]
-        for step in range(row[ENTRIES]):
-            first = (starts[row[KIND]] + step) % row[COUNT] * row[WORDS]
-            if row[WORDS] == 1:
-                kept[first] = live[first]
-            else:
-                _memcpy(kept[first:].ctypes.data, live[first:].ctypes.data, BYTES * row[WORDS])
+    rows = array_at(places, USUAL if usual else ALL, I8)
+    for first in range(0, len(rows), COLUMNS):
+        size = rows[first + SIZE]
+        for step in range(rows[first + ENTRIES]):
+            at = (starts[rows[first + KIND]] + step) % rows[first + COUNT] * size
+            _memcpy(rows[first + TO] + at, rows[first + FROM] + at, size)
