@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,22 +18,6 @@ if TYPE_CHECKING:
 
 EXIT_FAILED, EXIT_REFUSED = 1, 2
 Run = Callable[[argparse.Namespace], int]
-
-
-@contextlib.contextmanager
-def lean_imports() -> Iterator[None]:
-    """Import python-can without asammdf and numba without coverage, which they take where they are.
-
-    It is half a second more until a run is armed. asammdf, and pandas with it, is for MF4 files; no loop
-    reads one. coverage hears of compiled lines, where it measures; it is here already then.
-    """
-    hidden = [name for name in ("asammdf", "coverage") if name not in sys.modules]
-    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: not to be imported
-    try:
-        yield
-    finally:
-        for name in hidden:
-            del sys.modules[name]
 
 
 def one_thread() -> None:

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json
+from drivers.lean import without
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json
 
 if TYPE_CHECKING:
     from hil.runtime.configure import Result
@@ -28,7 +29,7 @@ def register(commands: Commands) -> None:
 
 def cmd_configure(args: argparse.Namespace) -> int:
     """Set a node up, or only compare."""
-    with lean_imports():
+    with without("coverage"):  # numba takes it where it is
         from hil.runtime.bus import bus_settings
         from hil.runtime.configure import compare, configure, job_of
     from hil.config.tables import RunConfig, load_toml

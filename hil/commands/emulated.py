@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, bus_flags, lean_imports, overrides, print_json, say
+from drivers.lean import without
+from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
 
 
 def register(commands: Commands) -> None:
@@ -48,7 +49,7 @@ def cmd_emulate(args: argparse.Namespace) -> int:
 
     if args.parent is not None:
         end_with(args.parent)
-    with lean_imports():
+    with without("coverage"):  # numba takes it where it is
         from hil.sim.emulate import serve
     serve(args.config, overrides(args), args.plant_set)
     return 0

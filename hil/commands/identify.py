@@ -10,11 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from drivers.lean import without
 from hil.commands.common import (
     EXIT_FAILED,
     Commands,
     bus_flags,
-    lean_imports,
     one_thread,
     overrides,
     print_json,
@@ -142,7 +142,7 @@ def _written(result: dict[str, Any], config: RunConfig, file: Path) -> dict[str,
 
 def _on_the_bus(args: argparse.Namespace, file: Path, cogging: bool = False) -> dict[str, Any]:
     """The experiments, with the emulator of the configuration where that is asked for."""
-    with lean_imports():
+    with without("coverage"):  # numba takes it where it is
         from hil.runtime.bus import is_emulated_bus
         from hil.runtime.refusals import check_arming
         from hil.runtime.setup import load_setup

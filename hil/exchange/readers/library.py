@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import can
-
+from drivers.libraries import can
 from hil.exchange.readers.recorded import (
     Found,
     NotThisFormatError,
