@@ -312,7 +312,7 @@ def test_an_emulated_drive_loads_no_exports_either(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["demo.toml", "cia402.toml"])
-def test_a_simulation_loads_what_reads_mf4_no_more_than_a_run(name: str) -> None:
+def test_a_simulation_loads_what_reads_mf4_no_more_than_a_run(configs: Path, name: str) -> None:
     """Nor does any command that a bus or its DBC is read for: python-can is imported in one way."""
-    _, *modules = loaded("simulate", str(ROOT / "configs" / name), "--no-log", "--set", "loop.duration_s=0.1")
+    _, *modules = loaded("simulate", str(configs / name), "--no-log", "--set", "loop.duration_s=0.1")
     assert {"can", "cantools"} <= set(modules) and not {"asammdf", "pandas"} & set(modules)
