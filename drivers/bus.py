@@ -13,10 +13,10 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any, NamedTuple, NoReturn, Protocol
 
+import can
 import numpy as np
 
 from drivers.errors import LinkDown, LinkError, QueueFull
-from drivers.libraries import can
 from drivers.local import (
     CLASSIC,
     EFF_FLAG,

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+import cantools
+
 from drivers.errors import DatabaseError
-from drivers.libraries import cantools
 
 MAX_DBC_BYTES: Final = 4 << 20
 _BOMS: Final = (

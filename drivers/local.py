@@ -18,7 +18,7 @@ import zlib
 from collections.abc import Collection
 from typing import Any
 
-from drivers.libraries import can
+import can
 
 LOOPBACK = "127.0.0.1"
 FIRST_PORT, PORTS = 16384, 16384  # below the ports that the kernel hands out by itself

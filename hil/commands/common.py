@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import json
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +20,33 @@ if TYPE_CHECKING:
 
 EXIT_FAILED, EXIT_REFUSED = 1, 2
 Run = Callable[[argparse.Namespace], int]
+
+
+@contextlib.contextmanager
+def lean_imports() -> Iterator[None]:
+    """Import python-can without asammdf and numba without coverage, which they take where they are.
+
+    It is half a second or more of each command. asammdf, and pandas with it, is for MF4 files. coverage hears
+    of compiled lines, where it measures; it is here already then.
+    """
+    hidden = [name for name in ("asammdf", "coverage") if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: not to be imported
+    try:
+        yield
+    finally:
+        for name in hidden:
+            del sys.modules[name]
+
+
+def lean(run: Run) -> Run:
+    """The command with :func:`lean_imports`."""
+
+    @functools.wraps(run)
+    def leanly(args: argparse.Namespace) -> int:
+        with lean_imports():
+            return run(args)
+
+    return leanly
 
 
 def one_thread() -> None:
@@ -33,10 +62,10 @@ class Commands:
         self.parser = parser
         self._commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(self, name: str, run: Run, text: str) -> argparse.ArgumentParser:
-        """Add one command with its ``--json`` flag and return its parser."""
+    def add(self, name: str, run: Run, text: str, *, mf4: bool = False) -> argparse.ArgumentParser:
+        """Add one command with its ``--json`` flag and return its parser; ``mf4``: it takes such files."""
         command = self._commands.add_parser(name, help=text, description=text)
-        command.set_defaults(run=run)
+        command.set_defaults(run=run if mf4 else lean(run))
         command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
         return command
 

@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.lean import without
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json
 
 if TYPE_CHECKING:
@@ -29,11 +28,10 @@ def register(commands: Commands) -> None:
 
 def cmd_configure(args: argparse.Namespace) -> int:
     """Set a node up, or only compare."""
-    with without("coverage"):  # numba takes it where it is
-        from hil.runtime.bus import bus_settings
-        from hil.runtime.configure import compare, configure, job_of
     from hil.config.tables import RunConfig, load_toml
     from hil.errors import HilError
+    from hil.runtime.bus import bus_settings
+    from hil.runtime.configure import compare, configure, job_of
 
     if args.check and (args.store or args.dbc):
         raise HilError("--check changes nothing: leave --store and --dbc out")

@@ -17,6 +17,7 @@ def register(commands: Commands) -> None:
         "Write LOG in another format, by the ending of FILE: ticks as .parquet .csv .mat .mf4, "
         "frames as .log (candump) .asc .blf, .mf4 with --frames. Of a run with several nodes ticks of each: "
         "those of the first are FILE, others have their names before the ending.",
+        mf4=True,
     )
     command.add_argument("logs", nargs="+", type=Path, metavar="LOG", help="a log, or the parts of one run")
     command.add_argument("-o", "--output", type=Path, metavar="FILE", required=True)
@@ -30,6 +31,7 @@ def register(commands: Commands) -> None:
         cmd_import,
         "Write REC, a recording of the bus (candump .log, .asc, .blf, .mf4, .trc), "
         "as a log of CONFIG's controller",
+        mf4=True,
     )
     command.add_argument("recording", type=Path, metavar="REC", help="a recording of frames")
     command.add_argument("-o", "--output", type=Path, metavar="LOG", required=True, help="an MCAP file")

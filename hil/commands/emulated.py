@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from drivers.lean import without
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
 
 
@@ -49,8 +48,8 @@ def cmd_emulate(args: argparse.Namespace) -> int:
 
     if args.parent is not None:
         end_with(args.parent)
-    with without("coverage"):  # numba takes it where it is
-        from hil.sim.emulate import serve
+    from hil.sim.emulate import serve
+
     serve(args.config, overrides(args), args.plant_set)
     return 0
 

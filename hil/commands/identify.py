@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from drivers.lean import without
 from hil.commands.common import (
     EXIT_FAILED,
     Commands,
@@ -142,15 +141,14 @@ def _written(result: dict[str, Any], config: RunConfig, file: Path) -> dict[str,
 
 def _on_the_bus(args: argparse.Namespace, file: Path, cogging: bool = False) -> dict[str, Any]:
     """The experiments, with the emulator of the configuration where that is asked for."""
-    with without("coverage"):  # numba takes it where it is
-        from hil.runtime.bus import is_emulated_bus
-        from hil.runtime.refusals import check_arming
-        from hil.runtime.setup import load_setup
     from hil.errors import HilError
     from hil.identify.coggingrun import on_the_bus, ready
     from hil.identify.plan import chosen
     from hil.identify.session import checked, identify, motor_toml
     from hil.runtime.arming import confirm
+    from hil.runtime.bus import is_emulated_bus
+    from hil.runtime.refusals import check_arming
+    from hil.runtime.setup import load_setup
 
     names, given = () if cogging else chosen(args.steps), overrides(args)
     if args.emulated and given.channel is None:

@@ -22,6 +22,7 @@ def register(commands: Commands) -> None:
         "play",
         cmd_play,
         "Send the data frames of LOG with their timing. By default only what the drive sent.",
+        mf4=True,
     )
     command.add_argument("log", type=Path, metavar="LOG", help=".mcap of hil, or .log .asc .blf .mf4 ...")
     bus = command.add_argument_group("bus (as python-can)")

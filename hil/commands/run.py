@@ -6,7 +6,6 @@ import argparse
 import sys
 from pathlib import Path
 
-from drivers.lean import without
 from hil.commands.common import EXIT_FAILED, Commands, bus_flags, overrides, print_json, say
 
 
@@ -40,14 +39,13 @@ def register(commands: Commands) -> None:
 
 def cmd_run(args: argparse.Namespace) -> int:
     """Run a config on its bus."""
-    with without("coverage"):  # numba takes it where it is
-        from hil.runtime.bus import is_emulated_bus
-        from hil.runtime.nodesession import run_nodes
-        from hil.runtime.nodesetup import load_node_setups
-        from hil.runtime.refusals import check_arming
-        from hil.runtime.session import run
-        from hil.runtime.setup import load_setup
     from hil.runtime.arming import confirm, requesting
+    from hil.runtime.bus import is_emulated_bus
+    from hil.runtime.nodesession import run_nodes
+    from hil.runtime.nodesetup import load_node_setups
+    from hil.runtime.refusals import check_arming
+    from hil.runtime.session import run
+    from hil.runtime.setup import load_setup
 
     nodes = load_node_setups(args.config, overrides(args))
     setups = list(nodes.values()) if nodes else [load_setup(args.config, overrides(args))]

@@ -12,9 +12,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+import can
 import numpy as np
 
-from drivers.libraries import can
 from hil.exchange.readers.asc import ERROR_COMMENT, START_COMMENT
 from hil.exchange.readers.recorded import ERROR, EXTENDED, ID_MASK, REMOTE
 from hil.log.frame import need

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from drivers.libraries import can
+import can
+
 from hil.exchange.readers.recorded import (
     Found,
     NotThisFormatError,
