@@ -103,7 +103,7 @@ TOGETHER_NS: Final = 4_000_000
 
 
 def together(period_ns: int, request: StopRequest) -> int:
-    """How many ticks one compiled call may run."""
+    """Periods after which a compiled call begins no other tick."""
     return 1 if request.polled else max(1, TOGETHER_NS // period_ns)
 
 
@@ -344,7 +344,7 @@ def ticks_of(io: Any, table: Any, k: int, deadline_ns: int, log_failed: bool) ->
     """
     plan, pace, marks = array_at(table, PLAN, I8), array_at(table, PACE, I8), array_at(table, MARKS, I8)
     before, t = news(table), array_at(table, TICK_AT, TICK)[0]
-    while pace[RAN] < plan[TOGETHER]:
+    while pace[RAN] + pace[LOST] < plan[TOGETHER]:  # by time: with a dead drive a tick is many periods
         mark(marks, LOOP, array_at(table, TIMES_AT, I8))
         stage = run_tick(io, table, t, pace, plan, NOT_BEGUN, k, deadline_ns, log_failed)
         if stage != RECORDED:

@@ -85,8 +85,8 @@ class StopRequest:
 class Plan:
     """Timing of a run: period and feedback timeout [ns], pacing, length in ticks (None: until stopped).
 
-    ``every``: ticks from one feedback to the next. ``together``: ticks that one compiled call may run; a
-    signal that comes while none of them waits is late by so much.
+    ``every``: ticks from one feedback to the next. ``together``: periods, skipped ones too, after which a
+    compiled call begins no other tick; a signal that comes while none of them waits is late by so much.
     """
 
     period_ns: int

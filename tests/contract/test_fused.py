@@ -45,7 +45,19 @@ from hil.runtime.guardian import (
 from hil.runtime.header import header_of
 from hil.runtime.inbox import Inbox, Place, ranges
 from hil.runtime.loop import RAMP_EVENT, Loop, Plan, StopRequest, Whole, no_whole, none_compiled
-from hil.runtime.rules import BEGUN, DECIDED, NOT_BEGUN, PACINGS, RAN, RECORDED, SENT, Pace, Pacing, new_pace
+from hil.runtime.rules import (
+    BEGUN,
+    DECIDED,
+    LOST,
+    NOT_BEGUN,
+    PACINGS,
+    RAN,
+    RECORDED,
+    SENT,
+    Pace,
+    Pacing,
+    new_pace,
+)
 from hil.runtime.setup import Overrides, Setup, load_setup
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
@@ -493,6 +505,8 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
                 stages[RECORDED] += int(pace[RAN])
                 stages[stage] += stage != RECORDED
                 together.append(int(pace[RAN]))
+                newest = 1 + int(record["skipped"][0]) if stage == RECORDED else 0
+                assert pace[RAN] + pace[LOST] - newest < TOGETHER, "Python has its turn by time"
                 return stage
 
             return whole
@@ -713,13 +727,14 @@ AND: dict[str, Callable[[Ran, str], None]] = {
 def parts(tmp_path: Path) -> Iterator[Parts]:
     """A client, its compiled tick and the other end of the wire, without a loop."""
     setup, words, request = setup_of(), Words(), StopRequest()
-    machine, plan = setup.machine.fresh(), Plan(PATIENT_NS, TIMEOUT_NS, "sync", TICKS)
+    machine, plan = setup.machine.fresh(), Plan(PATIENT_NS, TIMEOUT_NS, "sync", TICKS, together=4)
+    pace = new_pace()
     recorder = open_recorder(tmp_path / "run.mcap", header_of(setup, "run", "monotonic"), 1000)
     with ends() as (ours, theirs):
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
         client.prepare(recorder.record[0])
-        whole = fused.whole_tick(client, words, machine, recorder, plan, request, new_pace())
-        yield Parts(whole, words, recorder.record, theirs, request)
+        whole = fused.whole_tick(client, words, machine, recorder, plan, request, pace)
+        yield Parts(whole, words, recorder.record, theirs, request, pace)
         recorder.close({})
 
 
@@ -732,6 +747,7 @@ class Parts:
     record: TickArray
     end: socket.socket
     request: StopRequest
+    pace: Pace
 
     def silent(self) -> bool:
         """Nothing was sent, nothing stored."""
@@ -746,6 +762,14 @@ def test_a_tick_that_is_late_by_periods_is_the_one_whose_time_it_is(parts: Parts
     tick = parts.record[0]
     assert (tick["k"], tick["t_ns"], tick["gap"], tick["skipped"]) == (10, due_ns + 3 * PATIENT_NS, 4, 3)
     assert 0 <= tick["lateness_ns"] < PATIENT_NS
+
+
+def test_python_has_its_turn_by_time_not_by_ticks(parts: Parts) -> None:
+    """A drive that is dead makes each tick many periods long: a signal is not to wait for four of them."""
+    parts.words.cells[GUARD_NS] = time.monotonic_ns()
+    assert parts.whole(7, time.monotonic_ns(), False) == SENT, "what is asked is new"
+    assert parts.whole(8, time.monotonic_ns() - 3 * PATIENT_NS, False) == RECORDED
+    assert (parts.pace[RAN], parts.pace[LOST], parts.record["k"][0]) == (1, 3, 11)
 
 
 def test_nothing_is_sent_once_the_guardian_has_fired(parts: Parts) -> None:
