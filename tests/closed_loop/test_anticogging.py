@@ -80,6 +80,7 @@ def test_the_plants_harmonics_are_found_within_their_intervals() -> None:
     assert found.friction * K_T == pytest.approx(0.21, abs=0.03)
 
 
+@pytest.mark.long
 def test_the_ripple_of_a_slow_speed_drops_tenfold() -> None:
     before, after = simulated(), simulated(inline(taught()[0]))
     assert Reason(int(after["reason"][-1])) == Reason.STOP_REQUESTED
