@@ -31,7 +31,7 @@ from hil.control.linalg import Array
 from hil.runtime.setup import Overrides
 from hil.tuning.bench import bench_of, spec_in, speed_drive
 from hil.tuning.families import family
-from hil.tuning.loop import KICK, LOAD, NO_LIMIT, PULSE_I, PULSE_U, PULSE_W, QUIET, Plant, rigid, shaft
+from hil.tuning.loop import KICK, LOAD, NO_LIMIT, PULSE_I, PULSE_U, PULSE_W, QUIET, Plant, rigid, shaft, step
 from hil.tuning.measure import RESTLESS, SPARE, Bench, free
 from hil.tuning.optimise import law_of
 from hil.tuning.sensitivity import peak_of
@@ -75,12 +75,7 @@ def run(p: Any, s: Any, A: Array, b: Array, e: Array, notch: Array, kind: int, o
         load = 1.0 if kind == LOAD and k >= 0 else 0.0
         if k >= 0:
             out[0, k], out[1, k], out[2, k] = x[0], given, u
-        for r in range(n):
-            total = b[r] * given + e[r] * load
-            for c in range(n):
-                total += A[r, c] * x[c]
-            new[r] = total
-        x[:] = new
+        step(A, b, e, given, load, x, new)
 
 
 class Search:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import json
 import os
 import re
@@ -38,17 +37,6 @@ def lean_imports() -> Iterator[None]:
             del sys.modules[name]
 
 
-def lean(run: Run) -> Run:
-    """The command with :func:`lean_imports`."""
-
-    @functools.wraps(run)
-    def leanly(args: argparse.Namespace) -> int:
-        with lean_imports():
-            return run(args)
-
-    return leanly
-
-
 def one_thread() -> None:
     """One thread for matrices of three rows, which more make slower: set before numpy is imported."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -65,7 +53,7 @@ class Commands:
     def add(self, name: str, run: Run, text: str, *, mf4: bool = False) -> argparse.ArgumentParser:
         """Add one command with its ``--json`` flag and return its parser; ``mf4``: it takes such files."""
         command = self._commands.add_parser(name, help=text, description=text)
-        command.set_defaults(run=run if mf4 else lean(run))
+        command.set_defaults(run=run if mf4 else lean_imports()(run))
         command.add_argument("--json", action="store_true", help="print one JSON object instead of a table")
         return command
 

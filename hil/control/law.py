@@ -30,7 +30,7 @@ from hil.control.mtpa import POINTS, operating_point, voltage
 from hil.control.observer import FIR_MAX, Window, fill, shape_fill, shape_step, side_by_side, window_step
 from hil.control.regen import RegenLimit, braked, regen_params
 from hil.control.registry import Channel, InnerLoop, Plan, Shaft, laws, member, observers
-from hil.control.speed import COMMANDS, FOLLOWS, LEADS, ask_speed, share
+from hil.control.speed import COMMANDS, FOLLOWS, LEADS, ask_speed, share, slope_change
 from hil.control.speedfilter import (
     PAST,
     ROOM,
@@ -161,7 +161,7 @@ load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); f
 back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
 ``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed
 squared; ``pair``: a node's part in the law ``fac`` over two nodes (:data:`hil.control.speed.LEADS`);
-``jerk``: 1 when the reference's jerk is fed forward (:func:`slope_change`)."""
+``jerk``: 1 when the reference's jerk is fed forward (:func:`hil.control.speed.slope_change`)."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -711,19 +711,6 @@ def look_ahead(p: Any, s: Any) -> None:
         s["work"][0] += ahead(p, s)
     for c in range(3):
         s["d_p"][c] = s["d_hat"][c] + s["work"][c]
-
-
-@jit
-def slope_change(p: Any, s: Any, dw_ref: float) -> float:
-    """T_s w*'' [rad/s2], how the reference's slope changed over the last tick; 0 where it is not fed forward.
-
-    It is taken for how it goes on. A law asks once a tick.
-    """
-    if p["jerk"] == 0:
-        return 0.0
-    change = dw_ref - s["slope"]
-    s["slope"] = dw_ref
-    return float(change)
 
 
 @jit

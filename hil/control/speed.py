@@ -76,6 +76,19 @@ def look_ahead_speed(p: Any, s: Any) -> None:
 
 
 @jit
+def slope_change(p: Any, s: Any, dw_ref: float) -> float:
+    """T_s w*'' [rad/s2], how the reference's slope changed over the last tick; 0 where it is not fed forward.
+
+    It is taken for how it goes on. A law asks once a tick.
+    """
+    if p["jerk"] == 0:
+        return 0.0
+    change = dw_ref - s["slope"]
+    s["slope"] = dw_ref
+    return float(change)
+
+
+@jit
 def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     """The command that moves the speed error by e^{-pole T_s} a tick and leaves the inner loop its own pole.
 
@@ -89,9 +102,7 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     look_ahead_speed(p, s)
     a, b, kappa, T_s = p["Ad"][0, 0], p["Bd"][0, 0], p["kappa"], p["T_s"]
     drift = p["Ed"][0, 0] * s["d_hat"][0]
-    change, ahead = 0.0, 1.0 + p["delay"]
-    if p["jerk"]:
-        change, s["slope"] = dw_ref - s["slope"], dw_ref
+    change, ahead = slope_change(p, s, dw_ref), 1.0 + p["delay"]
     target = w_ref + ahead * T_s * (dw_ref + 0.5 * ahead * change)
     after = target + T_s * (dw_ref + (ahead + 0.5) * change)
     holds = kappa * (after - a * target - drift) / b

@@ -61,10 +61,10 @@ def load_words(shares: Mapping[str, float], emulated: Collection[str], bitrate: 
     own = {name: share for name, share in shares.items() if name not in emulated}
     load, more = sum(own.values()), sum(shares.get(name, 0.0) for name in emulated)
     frames = ", ".join(f"{name} {100 * share:.0f} %" for name, share in own.items())
-    words = f"{100 * load:.0f} % at {bitrate} bit/s with every stuff bit, without other nodes: {frames}"
+    text = f"{100 * load:.0f} % at {bitrate} bit/s with every stuff bit, without other nodes: {frames}"
     if more:
-        words += f"; {100 * more:.0f} % more by {', '.join(sorted(emulated))}, which no real drive sends"
-    return words, load <= MAX_LOAD
+        text += f"; {100 * more:.0f} % more by {', '.join(sorted(emulated))}, which no real drive sends"
+    return text, load <= MAX_LOAD
 
 
 def check_load(setup: Setup) -> None:

@@ -30,6 +30,7 @@ from hil.tuning.loop import (
     Record,
     one_mass,
     sampled,
+    step,
     two_masses,
 )
 from hil.tuning.sensitivity import Margins, margins_of, peak_of
@@ -157,13 +158,7 @@ def respond_current(
         for age in range(p["delay"], 0, -1):
             way[age] = way[age - 1]
         way[0] = s["u"][1] if closed else 0.0
-        for r in range(n):
-            total = b[r] * acts + e[r] * load
-            for c in range(n):
-                total += A[r, c] * x[c]
-            new[r] = total
-        for r in range(n):
-            x[r] = new[r]
+        step(A, b, e, acts, load, x, new)
 
 
 @jit

@@ -96,6 +96,18 @@ def _by_voltage(motor: MotorModel, T_s: float, A: Array, load: Array) -> Plant:
 
 
 @jit
+def step(A: Array, b: Array, e: Array, u: float, load: float, x: Array, new: Array) -> None:
+    """x+ = A x + b u + e load, in place; ``new`` (n,) is room for it."""
+    n = len(x)
+    for r in range(n):
+        total = b[r] * u + e[r] * load
+        for c in range(n):
+            total += A[r, c] * x[c]
+        new[r] = total
+    x[:] = new
+
+
+@jit
 def respond(p: Any, s: Any, A: Array, b: Array, e: Array, kind: int, out: Array) -> None:
     """The loop's response from rest; ``out`` (4, K): command, voltage, w, i_q from the disturbance on."""
     n, K = A.shape[0], out.shape[1]
@@ -119,13 +131,7 @@ def respond(p: Any, s: Any, A: Array, b: Array, e: Array, kind: int, out: Array)
         load = 1.0 if kind == LOAD and k >= 0 else 0.0
         if k >= 0:
             out[0, k], out[1, k], out[2, k], out[3, k] = u, given, x[0], x[1]
-        for r in range(n):
-            total = b[r] * given + e[r] * load
-            for c in range(n):
-                total += A[r, c] * x[c]
-            new[r] = total
-        for r in range(n):
-            x[r] = new[r]
+        step(A, b, e, given, load, x, new)
 
 
 @jit
