@@ -94,7 +94,7 @@ def recorded(channel: str) -> Iterator[list[can.Message]]:
     """Every frame on a bus."""
     frames: list[can.Message] = []
     bus = can.Bus(channel, "hil-local")
-    notifier = can.Notifier(bus, [frames.append])
+    notifier = can.Notifier(bus, [frames.append], timeout=0.02)
     try:
         yield frames
         time.sleep(0.05)

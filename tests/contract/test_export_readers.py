@@ -207,6 +207,7 @@ def test_what_fails_leaves_nothing_behind(tmp_path: Path, ending: str) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["bad.mcap"]
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("ending", list(module.FORMATS))
 @pytest.mark.parametrize("room", [2_000, 20_000])
 def test_a_full_disk_is_one_clear_line(path: Path, tmp_path: Path, ending: str, room: int) -> None:

@@ -83,6 +83,7 @@ def check(path: Path, own: tuple[str, ...]) -> dict[str, str]:
     return next(row for row in json.loads(done.stdout)["rows"] if row["check"] == "canopen")
 
 
+@pytest.mark.long
 def test_a_drive_on_strangers_stack(configs: Path, settings: Settings, channel: str) -> None:
     """durand: set up by its own EDS, NMT, states, a load step, stop; the log replays to the bit."""
     path, eds = run_config(configs), configs / "durand.eds"

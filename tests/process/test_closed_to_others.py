@@ -186,6 +186,7 @@ def test_sockets_are_of_this_machine_alone(bench: Bench) -> None:
     assert named and all(CLAIM.fullmatch(name) for name in named), "claims of identifiers: nobody reads them"
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.getuid() != 0, reason="needs root to start a process of another user")
 def test_another_user_gets_nowhere(bench: Bench) -> None:
     """The same, tried: another user reads no log, no ring, sets nothing, and can't stop the run."""

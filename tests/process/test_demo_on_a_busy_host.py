@@ -19,6 +19,7 @@ pytestmark = [pytest.mark.process, pytest.mark.alone]
 Settings = Callable[..., tuple[str, ...]]
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("name", [(), ('log.name="mine"',)])
 def test_it_goes_on_in_lockstep(
     configs: Path, settings: Settings, tmp_path: Path, name: tuple[str, ...]

@@ -47,7 +47,7 @@ def nodes_of(result: dict[str, Any]) -> tuple[Log, Log]:
     return tuple(open_log(Path(result["log"]), node=name) for name in ("motor", "load"))  # type: ignore[return-value]
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("motor_at", [0, 1])
 def test_one_law_commands_both(configs: Path, settings: Settings, motor_at: int, tmp_path: Path) -> None:
     """The speed is held against a load that nobody tells of, by the load machine; i_q stays what is asked."""

@@ -43,7 +43,7 @@ def test_rows_in_lockstep(tmp_path: Path) -> None:
     assert text.count("<figure>") == len(rows) and "http" not in text
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("drive", "names", "safe_ms"),
     [
@@ -148,6 +148,7 @@ def row_of(name: str, *more: str) -> Any:
     return row.model_copy(update={"set": [*row.set, *more]})
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("name", "weaker", "why"),
     [
@@ -170,6 +171,7 @@ IDLE = [
 ]
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(("changed", "why"), IDLE)
 def test_a_fault_that_does_nothing_fails_its_row(tmp_path: Path, changed: dict[str, Any], why: str) -> None:
     row = row_of("no fault").model_copy(update=changed)

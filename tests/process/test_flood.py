@@ -205,6 +205,7 @@ def test_a_flood_of_our_own_identifiers_ends_in_a_stop_that_tells_why(
     bench.assert_drive_is_at_rest()
 
 
+@pytest.mark.long
 def test_a_bus_that_is_flooded_from_the_beginning_never_sees_a_voltage(begin: Callable[[], Bench]) -> None:
     """Forged commands are another controller's: the run hears them, sends nothing, and says so in a line."""
     bench = begin()

@@ -121,6 +121,7 @@ def test_what_is_wrong_with_the_motor_is_named(
     assert result["file"] is None and not (configs.parent / "motor.toml").exists()
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("args", "words"),
     [

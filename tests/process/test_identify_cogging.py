@@ -71,6 +71,7 @@ def test_a_run_over_the_bus_with_a_file_replays_and_is_the_simulated_one(
         assert np.array_equal(log.ticks[name][:900], simulated[name][:900]), name
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("args", "said"),
     [

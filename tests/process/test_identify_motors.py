@@ -15,7 +15,7 @@ from benchmarks.motors import MORE
 pytestmark = [pytest.mark.process, pytest.mark.beside, pytest.mark.slow]
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*MORE, "50 W surface", "100 kW interior"])
 def test_a_motor_is_found_over_the_bus_and_no_frame_is_beyond_its_limits(tmp_path: Path, name: str) -> None:
     row = one_motor(name, tmp_path, lockstep=True)

@@ -93,6 +93,7 @@ def test_a_feedback_timeout_longer_than_any_tick_is_refused(configs: Path, setti
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("value", ["1e300", "1e-9", "-1.0", "nan", "20000.0"])
 def test_a_guardian_that_could_not_watch_is_refused(configs: Path, settings: Settings, value: str) -> None:
     done = call("run", str(configs / "demo.toml"), *flags(settings(f"guardian.timeout_ms={value}")))
@@ -100,6 +101,7 @@ def test_a_guardian_that_could_not_watch_is_refused(configs: Path, settings: Set
     assert "Traceback" not in done.stderr and "waiting" not in done.stderr
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&-", "<&- >&- 2>&-"])
 def test_closed_streams_are_no_traceback(
     configs: Path, settings: Settings, tmp_path: Path, closed: str

@@ -96,6 +96,7 @@ def test_paused_single_steps_and_going_on_at_a_terminal(tmp_path: Path, channel:
     assert found["frames sent"] == 3 + 200 + len(rest)
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("ending", [".log", ".asc", ".blf"])
 def test_python_cans_player_plays_what_we_export(tmp_path: Path, channel: str, ending: str) -> None:
     frames = bus_frames(60)

@@ -205,6 +205,7 @@ def test_a_real_bus_is_refused_without_arm(configs: Path, settings: Settings) ->
     assert done.returncode == 2 and "arm with --arm" in done.stderr
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("override", "said"),
     [

@@ -245,7 +245,7 @@ def writer_of(pid: int) -> int:
     raise AssertionError("there is no writer")
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("who", ["writer", "controller"])
 def test_killed_right_at_a_split(configs: Path, settings: Settings, tmp_path: Path, who: str) -> None:
     """The moment at which the second part appears; what was written before is there and replays."""

@@ -13,6 +13,7 @@ from tests.unit.test_tutorial import COMMANDS
 pytestmark = pytest.mark.process
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)  # it begins with kernels that may have to be compiled
 def test_every_command_of_the_tutorial_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -46,6 +46,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "env"
 
 
+@pytest.mark.long
 def test_the_demo_runs_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
     where = run(installed / "bin" / "python", "-c", "import hil; print(hil.__file__)", cwd=tmp_path)
     assert Path(where).is_relative_to(installed)
