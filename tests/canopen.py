@@ -82,6 +82,7 @@ def serving(run: Callable[[Callable[[], bool]], None], link: Link) -> Iterator[N
 def stranger(channel: str, node_id: int = NODE, eds: Path = EDS) -> Iterator[Any]:
     """A node of the canopen library: SDO server and object dictionary by strangers."""
     network = canopen.Network()
+    network.NOTIFIER_CYCLE = 0.02  # leaving takes as long
     network.connect(interface="hil-local", channel=channel)
     try:
         yield network.add_node(canopen.LocalNode(node_id, str(eds)))
