@@ -14,7 +14,10 @@ NODE_PACKAGES := @mcap/core@2.2.2 fzstd@0.1.1 @foxglove/ws-protocol@0.8.0 ws@8.2
 # itself. With LONG=1 they are all tests, and the longest of the first is the bench machine's.
 MARKS := (not process or beside) and not alone
 LESS := $(if $(LONG),, and not long)
-PARALLEL := --numprocesses=auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
+SPREAD := --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
+PARALLEL := --numprocesses=auto $(SPREAD)
+# Some of the first call wait for a tick's time: a third worker has two cores' rest. Not beside the bench machine.
+FIRST := $(if $(LONG),$(PARALLEL),--numprocesses=3 $(SPREAD))
 COVER := --cov=hil.control --cov=hil.tick.supervisor --cov=hil.tick.guard --cov=hil.tick.kernel --cov=drivers.codec --cov=drivers.e2e
 
 .PHONY: docs golden reference gallery demo test lint quick unit interpreted vm clean help crash faults soak fuzz guided mutants node
@@ -41,7 +44,7 @@ quick: $(STAMP) lint ## before each commit: lint, types, the fast tests
 	$(BIN)/python -m pytest -q $(PARALLEL) -m "$(MARKS) and not process and not slow" tests/unit tests/property tests/closed_loop
 
 unit: $(STAMP) ## the tests, compiled (LONG=1: all)
-	$(BIN)/python -m pytest $(PARALLEL) -m "$(MARKS)$(LESS)"
+	$(BIN)/python -m pytest $(FIRST) -m "$(MARKS)$(LESS)"
 	$(BIN)/python -m pytest $(PARALLEL) -m "process and not beside and not alone$(LESS)"
 	$(BIN)/python -m pytest -m "alone$(LESS)"
 

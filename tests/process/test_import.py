@@ -253,6 +253,7 @@ GOOD: dict[str, Edit] = {
 }
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("case", list(GOOD))
 def test_what_is_none_of_the_runs_frames_changes_no_command(steady: Ran, tmp_path: Path, case: str) -> None:
     """And comes back from our own exports as what it was."""

@@ -103,6 +103,7 @@ def test_newton_has_the_last_bits_after_its_steps() -> None:
         assert y * (1 + y) ** 3 == pytest.approx(m, rel=2e-14), (m, NEWTON)
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("L", [IPM, REVERSED, ROUND])
 @pytest.mark.parametrize("w", [0.0, 225.0, -300.0, 390.0])
 @pytest.mark.parametrize("share", [0.0, 0.3, -0.6, 0.97])

@@ -172,6 +172,7 @@ SOFT = {
 """Stable in all corners on a shaft of 120 Hz; of noise that is smaller than the step of i_d's frame."""
 
 
+@pytest.mark.long
 def test_noise_is_foretold_on_an_elastic_shaft_through_a_coarse_frame() -> None:
     """Rounding of i_d as white noise in a loop of full gain is up to 27 % off."""
     setup = load_setup(DEMO, Overrides(settings=settings_of(SOFT)))
@@ -202,6 +203,7 @@ def test_the_adaptive_design_of_the_theory_page_keeps_its_goal() -> None:
     assert mean_noise(setup, [], seen, 1e-3) <= 0.012 and seen.dip < 2.3 and seen.recovery_ms < 25
 
 
+@pytest.mark.long
 def test_noise_that_comes_in_bursts_is_foretold() -> None:
     """In one corner i_d now stays within the middle step of its frame and now swings out of it."""
     window = {"kind": "adaptive", "delay_ms": 33.0, "first_ms": 3.0, "w_noise_rad_s": 0.01041}

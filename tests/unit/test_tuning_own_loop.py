@@ -122,6 +122,7 @@ def test_the_sampled_current_loop_is_the_emulated_drive_s(period_us: int) -> Non
         assert s["x"][:2] == pytest.approx(x[:2], rel=1e-7, abs=1e-11)
 
 
+@pytest.mark.long
 def test_a_corner_near_its_limit_on_a_shaft_is_foretold() -> None:
     """A voltage that is held against the back-EMF feeds the acceleration back: here that is damping."""
     own = tables(286.73, 22.0)
