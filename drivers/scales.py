@@ -2,6 +2,7 @@
 
     torque  = raw / 1000 * 6076h [mN m]      current = raw / 1000 * 6075h [mA]
     speed   = raw * (unit in 60A9h), CiA 303-2: power of ten, numerator, denominator
+    angle   = raw * (unit in 60A8h), or increments by 608Fh where no gear stands between (6091h)
 
 Nothing is guessed: what the drive does not tell must stand in the config.
 """
@@ -9,23 +10,27 @@ Nothing is guessed: what the drive does not tell must stand in the config.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Final
 
 from drivers.errors import DatabaseError, NodeError
 from drivers.sdo import Sdo
-from drivers.units import SPEED, shown, unit_of
+from drivers.units import ANGLE, SPEED, shown, unit_of
 
 RATED_CURRENT, RATED_TORQUE, SPEED_UNIT = 0x6075, 0x6076, 0x60A9
+RESOLUTION, GEAR, ANGLE_UNIT = 0x608F, 0x6091, 0x60A8
 TORQUES: Final = (0x6071, 0x6072, 0x6074, 0x6077, 0x60B2, 0x60E0, 0x60E1)
 CURRENTS: Final = (0x6073, 0x6078)
 SPEEDS: Final = (0x606B, 0x606C, 0x60B1, 0x60FF)
+ANGLES: Final = (0x6064,)
 VOLTAGE: Final = 0x6079
 _UNITS: Final = {
     (0xB4, 0x47): "rpm", (0xB4, 0x03): "rev/s", (0x10, 0x03): "rad/s", (0x41, 0x03): "deg/s",
 }  # fmt: skip
 """CiA 303-2: revolutions, radians, degrees a minute or a second, by numerator and denominator."""
+_ANGLES: Final = {0xB4: "rev", 0x10: "rad", 0x41: "deg"}
 _CURRENT: Final = {"peak": "A", "rms": "Arms"}
 _TEXT: Final = re.compile(r"\s*(?:(\d+(?:\.\d+)?(?:[eE][+-]?\d+)?)(?:\s*/\s*(\d+))?\s+)?(\S.*)")
 
@@ -40,17 +45,23 @@ class Scale:
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What the config says of units: of speed ("rpm", "0.001 rpm", "1/4096 rev/s"), of 6075h (rms, peak)."""
+    """What the config says of units: of speed ("rpm", "0.001 rpm", "1/4096 rev/s"), of 6075h (rms, peak), of
+    angle ("1/4096 rev").
+    """
 
     velocity_unit: str = ""
     rated_current: str = ""
+    position_unit: str = ""
 
 
-def speed_scale(text: str, where: str) -> Scale:
-    """A unit of speed with a factor before it. Raises DatabaseError."""
-    found = _TEXT.fullmatch(text)
-    if found is None or unit_of(found[3], SPEED) is None or found[2] == "0":
-        raise DatabaseError(f'{where} = "{text}": give a unit of {shown(SPEED)}, as "rpm" or "1/4096 rev/s"')
+def speed_scale(text: str, where: str, units: Mapping[str, float] = SPEED) -> Scale:
+    """A unit of speed, or of ``units``, with a factor before it. Raises DatabaseError."""
+    found, example = _TEXT.fullmatch(text), "rpm" if units is SPEED else "rev"
+    if found is None or unit_of(found[3], units) is None or found[2] == "0":
+        counted = "1/4096 rev/s" if units is SPEED else "1/4096 rev"
+        raise DatabaseError(
+            f'{where} = "{text}": give a unit of {shown(units)}, as "{example}" or "{counted}"'
+        )
     return Scale(Fraction(found[1] or "1") / int(found[2] or 1), found[3])
 
 
@@ -66,7 +77,7 @@ class Scales:
 
     def __init__(self, sdo: Sdo, said: Said) -> None:
         self._sdo, self._said = sdo, said
-        self._kept: dict[str, Scale] = {}
+        self._kept: dict[str, Scale | None] = {}
         self.told: dict[str, str] = {}
         """What the node said of them, in words."""
 
@@ -76,6 +87,7 @@ class Scales:
             (TORQUES, "rated torque", self._torque),
             (CURRENTS, "rated current", self._current),
             (SPEEDS, "unit of speed", self._speed),
+            (ANGLES, "unit of angle", self._angle),
         ):
             if index in indices:
                 if kind not in self._kept:
@@ -109,6 +121,32 @@ class Scales:
             )
         return rated
 
+    def _angle(self) -> Scale | None:
+        """What 6064h counts in; None where nobody says: it stays a plain number, which no loop takes."""
+        given, told = self._said.position_unit, self._told_angle()
+        said = speed_scale(given, "canopen.position_unit", ANGLE) if given else None
+        if told and said and not _same(told[0], said, ANGLE):
+            raise DatabaseError(
+                f'canopen.position_unit = "{given}", but {told[1]} says {_words(told[0])}; leave the key '
+                "out, or set the drive's"
+            )
+        scale = told[0] if told else said
+        if scale:
+            self.told["unit_of_angle"] = f"{_words(scale)} ({told[1] if told else 'canopen.position_unit'})"
+        return scale
+
+    def _told_angle(self) -> tuple[Scale, str] | None:
+        """The unit in 60A8h, else a turn by its increments."""
+        raw = self._sdo.optional_int(ANGLE_UNIT) or 0
+        if raw >> 16 & 0xFF in _ANGLES:
+            power = (raw >> 24 ^ 0x80) - 0x80
+            return Scale(Fraction(10) ** power, _ANGLES[raw >> 16 & 0xFF]), "60A8h"
+        gear = [self._sdo.optional_int(GEAR, sub) for sub in (1, 2)]
+        counts, turns = (self._sdo.optional_int(RESOLUTION, sub) for sub in (1, 2))
+        if gear[0] != gear[1] or not counts or not turns:
+            return None
+        return Scale(Fraction(turns, counts), "rev"), "608Fh"
+
     def _speed(self) -> Scale:
         given = self._said.velocity_unit
         raw = self._sdo.optional_int(SPEED_UNIT)
@@ -131,8 +169,8 @@ class Scales:
         return scale
 
 
-def _same(one: Scale, other: Scale) -> bool:
-    factors = [unit.factor if (unit := unit_of(scale.unit, SPEED)) else 0.0 for scale in (one, other)]
+def _same(one: Scale, other: Scale, units: Mapping[str, float] = SPEED) -> bool:
+    factors = [unit.factor if (unit := unit_of(scale.unit, units)) else 0.0 for scale in (one, other)]
     return abs(float(one.factor) * factors[0] / (float(other.factor) * factors[1]) - 1.0) < 1e-12
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 ELECTRICAL: Final = math.nan
@@ -62,7 +62,7 @@ FIRST: Final = {
     id(DRIVE_TORQUE): "N m",
 }
 _SHOWN: Final = {
-    id(ANGLE): "rad, rev, deg",
+    id(ANGLE): "rad, rev, deg, 1/4096 rev (of an encoder that counts so many a turn)",
     id(SPEED): "rad/s, rpm, 1/min, rev/s, deg/s, erpm",
     id(CURRENT): "A, mA, Arms",
     id(VOLTAGE): "V, mV, kV",
@@ -71,6 +71,7 @@ _SHOWN: Final = {
     id(DRIVE_TORQUE): "N m, mNm, per mille",
 }
 _SPELLING: Final = str.maketrans({"⁻": "-", "¹": "1", "−": "-"} | dict.fromkeys("·*×⋅ \xa0\t[]"))
+_COUNTED: Final = re.compile(r"\s*(\d+(?:\.\d+)?)\s*/\s*(\d+(?:\.\d+)?)\s+(\S.*)")
 _MILLI: Final = re.compile(r"M(?=v|a|n)", re.IGNORECASE)
 
 
@@ -96,8 +97,12 @@ def plain(text: str) -> str:
 def unit_of(text: str, units: Mapping[str, float]) -> Unit | None:
     """What a unit is among those of a quantity; None for one that is not known or could be two.
 
-    Upper and lower case are the same, but for M and m, which are a factor of a thousand million.
+    Upper and lower case are the same, but for M and m, which are a factor of a thousand million. Before the
+    unit may stand what one count is of it: "1/4096 rev".
     """
+    if (counted := _COUNTED.fullmatch(text)) and float(counted[2]):
+        unit = unit_of(counted[3], units)
+        return unit and replace(unit, factor=unit.factor * float(counted[1]) / float(counted[2]))
     wanted = plain(text)
     factor = units.get(wanted)
     if factor is None and not (wanted.startswith("M") and _MILLI.match(wanted)):

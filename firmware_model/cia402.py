@@ -27,10 +27,14 @@ START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 1, 2, 128,
 CSP, CSV, CST = 8, 9, 10
 MILLI_RPM: Final = math.pi / 30e3
 """Unit of 606Ch and 60FFh [rad/s], as 60A9h of the EDS says."""
-WIRE: Final = Wire(MILLI_RPM, MILLI_RPM * (2.0**31 - 1.0), 1e-9, 1e6, 1e-9, 1e6)
-"""Resolution and range of the measured signals: the speed's; a torque is rounded where it is sent."""
 INCREMENTS: Final = 4096
 """Of a turn, as 608Fh of the EDS says."""
+INCREMENT: Final = 2.0 * math.pi / INCREMENTS
+"""Unit of 6064h and 607Ah [rad]."""
+WIRE: Final = Wire(
+    MILLI_RPM, MILLI_RPM * (2.0**31 - 1.0), 1e-9, 1e6, 1e-9, 1e6, theta_lsb=INCREMENT, theta_counts=2.0**32
+)
+"""Resolution and range of the measured signals: speed and position; a torque is rounded where it is sent."""
 SYNCHRONOUS: Final = 240
 RPDO_TIMEOUT, RPDO_LENGTH, CONNECTION = 0x8250, 0x8210, 0x8100
 """Error codes of CiA 301: no RPDO in time, one too short, the connection left while it was enabled."""
@@ -75,7 +79,7 @@ class Cia402Frames(Synchronous):
         self._nmt = PRE_OPERATIONAL
         self._objects.operational = False
         self._objects.restart()
-        self._count, self._position, self._total = -1, 0.0, 0.0
+        self._count, self._total = -1, 0.0
         self._error, self._told, self._ramping, self._cut = 0, 0, False, False
         self._stops = False
         self._since = dict.fromkeys(TPDOS, 0)
@@ -199,8 +203,9 @@ class Cia402Frames(Synchronous):
         """Speed [rad/s] that velocity or position mode asks for."""
         if mode == CSV:
             return self._objects.get(0x60FF) * MILLI_RPM
-        turn = self._objects.get(0x607A) * 2.0 * math.pi / INCREMENTS
-        return POSITION_GAIN * (turn - self._position)
+        assert self._drive is not None  # noqa: S101 - a command came
+        error = self._objects.get(0x607A) * INCREMENT - float(self._drive.sample["theta"])
+        return POSITION_GAIN * error
 
     def _speed_loop(self, w_ref: float, state: Any) -> float:
         """A PI of the drive's own, by the inertia of its motor."""
@@ -259,7 +264,6 @@ class Cia402Frames(Synchronous):
             self._quick_stop(state)
         self._stops = False
         w = float(state["x"][0])
-        self._position += w * period_s
         enabled = state["state"] == State.OPERATION_ENABLED
         mode = self._objects.get(0x6060)
         if not enabled:
@@ -318,7 +322,7 @@ _LIVE: Final[dict[int, Callable[[Cia402Frames, Kernels], float]]] = {
     0x603F: lambda node, drive: node._error if drive.state["error"] else 0,
     0x6041: lambda node, drive: node.statusword(drive),
     0x6061: lambda node, drive: node._objects.get(0x6060),
-    0x6064: lambda node, drive: _clipped(node._position * INCREMENTS / (2.0 * math.pi), 32),
+    0x6064: lambda node, drive: round(drive.sample["theta"] / INCREMENT),
     0x606C: lambda node, drive: _clipped(drive.sample["w"] / MILLI_RPM, 32),
     0x6077: lambda node, drive: _clipped(1000.0 * node._torque_now(drive) / node._rated, 16),
     0x6078: lambda node, drive: _clipped(1e6 * drive.sample["i_q"] / node._objects.get(0x6075), 16),

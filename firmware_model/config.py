@@ -370,6 +370,8 @@ class Wire:
     i_d_top: float
     theta_lsb: float = 0.0
     """Of the shaft's angle; 0: it is not reported."""
+    theta_counts: float = 0.0
+    """Numbers of its counter, signed, which goes on over turns and then begins anew; 0: within a turn."""
 
 
 def build_params(config: PlantConfig, wire: Wire) -> Record:

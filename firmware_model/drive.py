@@ -21,7 +21,7 @@ from firmware_model.load import edge_after, load_torque
 from firmware_model.motor import move
 from firmware_model.plant import ANGLE, LOAD_SPEED, PROTOCOL_VERSION, TWIST, ErrorCode, State
 from firmware_model.rub import friction_torque, rub
-from firmware_model.sensors import measure, to_turn, whole_degrees
+from firmware_model.sensors import measure, to_angle, whole_degrees
 from firmware_model.speedfilter import track
 
 
@@ -195,7 +195,7 @@ def on_sync(p: Any, s: Any, out: Any) -> None:
     out["w"] = measure(s, s["seen_w"] if p["filter"] > 0 else x[0], p["w_noise"], p["w_lsb"], p["w_top"])
     out["i_q"] = measure(s, x[1], p["i_noise"], p["i_q_lsb"], p["i_q_top"])
     out["i_d"] = measure(s, x[2], p["i_noise"], p["i_d_lsb"], p["i_d_top"])
-    out["theta"] = to_turn(s["series"][ANGLE, 0], p["theta_lsb"])
+    out["theta"] = to_angle(s["series"][ANGLE, 0], p["theta_lsb"], p["theta_counts"])
     out["echo"], out["state"], out["limited"] = s["echo"], s["state"], s["limited"]
     out["protocol_version"] = PROTOCOL_VERSION
     out["v_dc"] = min(np.rint(link_voltage(p, s) / 0.1), 65535.0) * 0.1

@@ -36,7 +36,7 @@ from firmware_model.faults import (
 )
 from firmware_model.jit import jit
 from firmware_model.plant import ANGLE, LOAD_SPEED, TWIST, ErrorCode, State
-from firmware_model.sensors import to_turn, to_wire
+from firmware_model.sensors import to_angle, to_wire
 
 OPEN_PHASE_STEP_NS: Final = 50_000
 _KEPT: Final = ("t_ns", "started", "temperature", "random", "syncs")
@@ -181,7 +181,8 @@ class PlantFaults:
             elif isinstance(fault, EncoderReversed):
                 self._slip(s, out, -2.0 * self._electrical(s))
                 self._set(out, -out["w"], out["i_q"], out["i_d"])
-                out["theta"] = to_turn(-s["series"][ANGLE, 0], self._params[0]["theta_lsb"])
+                p = self._params[0]
+                out["theta"] = to_angle(-s["series"][ANGLE, 0], p["theta_lsb"], p["theta_counts"])
             elif isinstance(fault, PhaseSwap):
                 self._swap(s, out, -2.0 * self._electrical(s))
             elif isinstance(fault, Bias):

@@ -160,8 +160,8 @@ class MoteusFrames(Synchronous):
     beat_ns = 0
     """It speaks when it is asked, never by itself."""
     counter_modulus = 256
-    wire = Wire(1e-6, 1e5, 1e-6, 1e4, 1e-6, 1e4)
-    """Of float32 on the wire: rounded before to what its bits hold."""
+    wire = Wire(1e-6, 1e5, 1e-6, 1e4, 1e-6, 1e4, theta_lsb=1e-6, theta_counts=2.0**53)
+    """Of float32 on the wire: rounded before to what its bits hold, the position over turns."""
     spoken: dict[int, int] | None = None
     """It answers what it is asked for, in a frame as long as that takes."""
 
@@ -170,7 +170,6 @@ class MoteusFrames(Synchronous):
         self._on = self._clear = False
         self._counter = 0
         self._asked = Asked()
-        self._turns, self._turned_ns = 0.0, 0
         self._default_ns: int | None = None
         self._drive: Kernels | None = None
         self._known: dict[int, Callable[[], float]] | None = None
@@ -251,9 +250,6 @@ class MoteusFrames(Synchronous):
         """The truth, then what was asked; the answer wakes the loop."""
         if self._drive is None:
             return []
-        now_ns = int(self._drive.state["t_ns"])
-        self._turns += out["w"] / TURN * (now_ns - self._turned_ns) * 1e-9
-        self._turned_ns = now_ns
         truth = (TRUTH & ~0x7F | self._node, struct.pack("<ff", out["T_L_true"], out["w_true"]), False)
         return ([truth] if self._truth else []) + self._reply(self._drive)
 
@@ -285,7 +281,7 @@ class MoteusFrames(Synchronous):
         sample = drive.sample
         return {
             MODE: lambda: self._mode(drive.state),
-            0x001: lambda: self._turns,
+            0x001: lambda: sample["theta"] / TURN,
             VELOCITY_AT: lambda: sample["w"] / TURN,
             0x003: lambda: sample["i_q"] * drive.params["drive_k_t"],
             0x004: lambda: sample["i_q"],

@@ -145,6 +145,7 @@ PARAMETERS: Final = {
     "i_q_lsb": Parameter(lambda c, w: w.i_q_lsb, "A"),
     "i_d_lsb": Parameter(lambda c, w: w.i_d_lsb, "A"),
     "theta_lsb": Parameter(lambda c, w: w.theta_lsb, "rad"),
+    "theta_counts": Parameter(lambda c, w: w.theta_counts),
     "w_top": Parameter(lambda c, w: w.w_top, "rad/s"),
     "i_q_top": Parameter(lambda c, w: w.i_q_top, "A"),
     "i_d_top": Parameter(lambda c, w: w.i_d_top, "A"),
@@ -191,10 +192,11 @@ PARAMETERS: Final = {
 }
 """Motor, inverter, sensors and firmware, by the name that kernels use; no order means anything.
 
-``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported. ``turns``: the angle is kept. ``varying``: a
-load changes within a substep, the q axis saturates (``L_q_saturation`` 0: not) or the coupling is soft
-(``J_load`` 0: not, and ``J`` is all of the inertia); ``rubs`` 0: no friction, no brake; ``capacitance`` 0:
-the DC link stays at v_dc, else that is the no-load voltage. ``takes``: what a command is (:class:`Takes`);
+``*_lsb`` 0: no rounding, of ``theta_lsb`` no angle is reported; ``theta_counts`` 0: within a turn.
+``turns``: the angle is kept. ``varying``: a load changes within a substep, the q axis saturates
+(``L_q_saturation`` 0: not) or the coupling is soft (``J_load`` 0: not, and ``J`` is all of the inertia);
+``rubs`` 0: no friction, no brake; ``capacitance`` 0: the DC link stays at v_dc, else that is the no-load
+voltage. ``takes``: what a command is (:class:`Takes`);
 gains and shares of reset are those of the sampled current loop; ``filter`` is of the speed
 (:class:`Filter`), with its poles, or the samples of a mean and their period.
 """

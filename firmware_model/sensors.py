@@ -73,10 +73,16 @@ def to_wire(value: float, lsb: float, top: float) -> float:
 
 
 @jit
-def to_turn(theta: float, lsb: float) -> float:
-    """An angle within a turn, rounded to the wire's resolution; NaN where it is not reported."""
+def to_angle(theta: float, lsb: float, counts: float) -> float:
+    """An angle rounded to the wire's resolution, within a turn or on a signed counter of so many numbers.
+
+    NaN where it is not reported.
+    """
     if lsb <= 0.0:
         return math.nan
+    if counts > 0.0:
+        raw = np.rint(theta / lsb)
+        return float((raw - counts * math.floor((raw + 0.5 * counts) / counts)) * lsb)
     turn = 2.0 * math.pi
     return float(np.rint((theta - math.floor(theta / turn) * turn) / lsb) * lsb)
 

@@ -118,6 +118,8 @@ class Reason(IntEnum):
     CURRENT_UNCONTROLLED = 29
     STALE_STATUS = 30
     NODE_STOPPED = 31
+    ANGLE_ERROR = 32
+    ANGLE_JUMP = 33
 
 
 class GuardFlag(IntEnum):
@@ -243,6 +245,9 @@ FIELDS: Final[tuple[Field, ...]] = (
     Field(38, "T_L_sent", "f8", "N m", "input",
           "fac over two nodes: the load machine's torque command of this tick, 0 when it is off; else 0",
           absent=0),
+    Field(39, "theta_ref", "f8", "rad", "input",
+          "reference angle from where it was armed (position), NaN for other laws", absent=math.nan,
+          shown=Shown("angle", "θ*")),
     Field(69, "theta", "f8", "rad", "input", "measured mechanical angle, NaN where the drive reports none",
           absent=math.nan, shown=Shown("theta", "theta", compared=False)),
     Field(48, "state", "u4", "", "output", "DriveState of the supervisor",
@@ -282,6 +287,12 @@ FIELDS: Final[tuple[Field, ...]] = (
                       line="load estimate", span=0.2)),
     Field(68, "i_d_ref", "f8", "A", "output", "d current asked for; 0 for most laws", absent=0,
           shown=Shown("current", "i_d*", 3, False, live="current", what_if=True)),
+    Field(70, "theta_turned", "f8", "rad", "output",
+          "angle from where it was armed, over turns (position), NaN for other laws",
+          shown=Shown("angle", "θ", 1)),
+    Field(71, "theta_error", "f8", "rad", "output",
+          "following error of the angle, theta_ref - theta_turned (position), NaN for other laws",
+          shown=Shown("angle_error", "θ* − θ", line="angle error", span=0.01)),
 )  # fmt: skip
 
 
@@ -312,11 +323,18 @@ INPUTS: Final = tuple(f.name for f in FIELDS if f.role == "input")
 OUTPUTS: Final = tuple(f.name for f in FIELDS if f.role == "output")
 
 
+_NONE: Final = (
+    "v_dc", "temperature_motor", "temperature_inverter", "T_L_true", "theta", "theta_ref", "theta_turned",
+    "theta_error",
+)  # fmt: skip
+"""What is no number until something writes it."""
+
+
 def _new_tick() -> TickArray:
     tick = np.zeros(1, TICK)
     for field in FIELDS:
         tick[f"_{field.number}"] = tag(field.number, field.kind)
-    for name in ("v_dc", "temperature_motor", "temperature_inverter", "T_L_true", "theta"):
+    for name in _NONE:
         tick[name] = np.nan
     return tick
 

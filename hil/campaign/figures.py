@@ -17,6 +17,7 @@ import numpy as np
 from hil.campaign.margins import DESIGN
 from hil.config.limits import LimitsTable
 from hil.config.tables import RunConfig
+from hil.report.angles import Angles
 from hil.report.criteria import FIGURES, check_limit, demanded, outcome_of
 from hil.report.curves import F8
 from hil.report.excursions import Excursions
@@ -72,6 +73,7 @@ class Judged:
     totals: Totals = field(default_factory=Totals)
     responses: Responses = field(default_factory=Responses)
     excursions: Excursions = field(default_factory=Excursions)
+    angles: Angles = field(default_factory=Angles)
     phases: Phases = NO_PHASES
     reason: Reason = Reason.NONE
     state: DriveState = DriveState.SWITCH_ON_DISABLED
@@ -89,6 +91,8 @@ class Judged:
             self.totals.feed(t, found, step)
             self.responses.feed(t, found)
             self.excursions.feed(t, found)
+            if self.config.follows_angle:
+                self.angles.feed(t, found)
             self._extra(found)
 
     def _extra(self, found: Columns) -> None:
@@ -109,6 +113,7 @@ class Judged:
             totals=self.totals,
             responses=self.responses,
             excursions=self.excursions,
+            angles=self.angles,
             phases=self.phases,
             log=result,
             bus_load=lambda: None,

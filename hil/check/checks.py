@@ -18,6 +18,7 @@ from drivers.errors import DriverError, LinkError
 from drivers.kernel import InterfaceFacts, interface_facts
 from drivers.listen import Heard, Traffic, listen, part_values
 from drivers.mapping import MEASURED
+from hil.check.angle import angle_rows
 from hil.check.filtered import filter_rows
 from hil.check.preflight import Row, Verdict, clock_row, disk_row, realtime_rows, row, sync_rows
 from hil.check.seldom import seldom_rows
@@ -58,6 +59,7 @@ def check(setup: Setup) -> list[Row]:
         *speed_filter_rows(setup),
         *seldom_rows(setup),
         *shaft_rows(setup),
+        *angle_rows(setup),
         load_row(setup),
         *adaptive_rows(setup),
         *heard_rows(setup),
@@ -76,7 +78,7 @@ def check_nodes(setups: Nodes) -> list[Row]:
     rows = bus_rows(first)
     for name, setup in setups.items():
         own = [*reach_rows(setup), *speed_filter_rows(setup), *shaft_rows(setup), *adaptive_rows(setup)]
-        own += [*heard_rows(setup), *canopen_rows(setup)]
+        own += [*angle_rows(setup), *heard_rows(setup), *canopen_rows(setup)]
         rows += [replace(one, check=f"{name}: {one.check}") for one in own]
     found, good = nodes_load(setups)
     rows += [row("bus load", good, found, LOAD_REMEDY), *realtime_rows(config.realtime)]

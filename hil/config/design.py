@@ -21,7 +21,7 @@ from hil.control.cogging import Harmonics
 from hil.control.errors import ControlDesignError
 from hil.control.jit import COMPILED, entry, place_of
 from hil.control.law import ChannelSpec, LawSpec, MotorModel, design_law, new_law_state
-from hil.control.references import reference
+from hil.control.references import move, reference
 from hil.control.regen import RegenLimit
 from hil.control.registry import InnerLoop, Shaft, SpeedFilter
 from hil.control.speedfilter import MOST_AVERAGE
@@ -74,6 +74,8 @@ class WireFacts:
     T_L_top: float = math.inf
     slow: tuple[SlowMessage, ...] = ()
     measured: tuple[str, ...] = ()
+    theta_span: float = 0.0
+    """Of the angle's counter until it begins anew [rad], where that is no whole number of turns; else 0."""
 
     @property
     def absent(self) -> int:
@@ -212,6 +214,8 @@ def elastic_shaft(motor: MotorTable) -> Shaft | None:
     return Shaft(2.0 * math.pi * given.resonance_hz, given.damping_ratio, 1.0 / (1.0 + given.inertia_ratio))
 
 
+ANGLE_JUMP = 0.5
+"""What the measured angle may lately have moved by that the speed does not tell [rad]."""
 OTHER_MOTOR = 0.1
 """Share by which the torque constant of a file's motor may be off, as its identification may be."""
 
@@ -298,6 +302,8 @@ def known_weight(config: RunConfig) -> Harmonics | None:
 def by_angle(config: RunConfig) -> str:
     """The key of what needs the shaft's angle; empty where nothing does."""
     controller = config.controller
+    if config.follows_angle:
+        return "controller.kind position"
     if controller.anticogging is not None:
         return "controller.anticogging"
     known = controller.known_load
@@ -375,8 +381,9 @@ def safety_params(config: RunConfig, wire: WireFacts) -> Record:
         p["k_u"], p["u_i"], p["absent"] = inner.k_u, inner.u_i, wire.absent
         p["scheduled"] = inner.every - 1
     p["absent"] |= 0 if "angle" in wire.measured else NO_ANGLE
+    p["theta_jump"] = ANGLE_JUMP if config.follows_angle else 0.0
     if config.loop.shadow:  # command and reference are somebody else's, not ours
-        for name in ("deviation_max", "w_error_max", "i_d_max", "open_phase_min"):
+        for name in ("deviation_max", "w_error_max", "theta_error_max", "i_d_max", "open_phase_min"):
             p[name] = math.inf
     return p
 
@@ -431,12 +438,16 @@ def _optional(limits: LimitsTable) -> dict[str, float]:
         "i_d_max": or_never(limits.i_d_max_a),
         "open_phase_min": or_never(limits.open_phase_min_a),
         "w_error_max": or_never(limits.following_error_rad_s),
+        "theta_error_max": or_never(limits.following_error_rad),
         "deviation_max": or_never(limits.applied_deviation_max_v),
     }
 
 
 def reference_record(table: ReferenceTable) -> Record:
     """The reference profile of the config."""
+    if table.kind == "move":
+        jerk = table.jerk_rad_s3 or math.inf
+        return move(table.way, table.w_rad_s, table.rate_rad_s2, jerk, table.at_s)
     given = table.model_dump(exclude={"kind", "t_s"}, exclude_none=True)
     names = {
         "w_rad_s": "w",
@@ -458,10 +469,14 @@ def build(config: RunConfig, wire: WireFacts) -> Machine:
     """Design the controller of a run. Raises ControlDesignError."""
     told = not wire.absent & NO_I_Q
     if (key := by_angle(config)) and "angle" not in wire.measured:
+        remedy = 'take "speed"' if config.follows_angle else "leave this out"
         raise ControlDesignError(
-            f"{key}: the drive reports no angle; name it in drive.signals.angle, or leave this out"
+            f"{key}: the drive reports no angle; name it in drive.signals.angle, or {remedy}"
         )
     law = design_law(law_spec(config, told), 1.0 / config.loop.rate_hz)
+    if config.follows_angle:
+        _each_tick(config, key)
+        law["theta_span"] = wire.theta_span
     return Machine(
         safety_params(config, wire),
         new_safety_state(),

@@ -152,6 +152,8 @@ class CanopenTable(Table):
     """Deadline of the command (1400h:5), the drive's own watchdog where it has one; left out: not written."""
     velocity_unit: str = ""
     """What 606Ch counts in where 60A9h does not tell: "rpm", "0.001 rpm", "1/4096 rev/s"."""
+    position_unit: str = ""
+    """What 6064h counts in where neither 60A8h nor 608Fh tell, or a gear stands between: "1/4096 rev"."""
     rated_current: Literal["rms", "peak"] | None = None
     """What the drive's rated current (6075h) is; needed where 6078h is mapped."""
     answer_timeout_s: Annotated[float, Field(ge=0.01, le=60, allow_inf_nan=False)] = 0.5

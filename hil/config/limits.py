@@ -61,6 +61,8 @@ class LimitsTable(Table):
     out: no such limit."""
     following_error_rad_s: Positive | None = None
     """Largest |w* - w| for following_error_s (FOLLOWING_ERROR); left out: no such limit."""
+    following_error_rad: Positive | None = None
+    """Largest |theta* - theta| of the law position for following_error_s (ANGLE_ERROR); needed by it."""
     following_error_s: Annotated[float, Field(ge=1e-6, le=3600, allow_inf_nan=False)] = 0.1
     """How long the following error may be too large."""
     i_d_max_a: Positive | None = None
@@ -147,6 +149,12 @@ class CriteriaTable(Table):
     """Speed ripple at rest, rms."""
     iae_max_rad: NonNegative | None = None
     """Integral of |w - w*|."""
+    angle_error_rms_max_rad: NonNegative | None = None
+    """Following error of the angle, rms."""
+    angle_error_peak_max_rad: NonNegative | None = None
+    """Largest following error of the angle."""
+    angle_settling_max_s: NonNegative | None = None
+    """From the end of the last move until the angle stays within 0.01 rad."""
     skipped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None
     """Periods that the loop skipped."""
     dropped_max: Annotated[int, Field(ge=0, le=10**15)] | None = None

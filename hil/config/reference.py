@@ -1,12 +1,13 @@
-"""Tables of the speed reference w*, of the way to rest, and of set-points at run time."""
+"""Tables of the speed reference w*, of moves, of the way to rest, and of set-points at run time."""
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from hil.config.table import Finite, NonNegative, Positive, Since, Speed, Table
+from hil.config.table import LEAST, Finite, NonNegative, Positive, Since, Speed, Table
 
 
 class StepReference(Table):
@@ -89,8 +90,41 @@ class TableReference(Table):
         return self
 
 
+class MoveReference(Table):
+    """A move from rest to rest by ``target_turns`` or ``target_rad`` from where the shaft is armed.
+
+    The speed reaches ``w_rad_s``, or less where the way is too short for it. The law position ends at the
+    target; of others it is the speed alone.
+    """
+
+    kind: Literal["move"]
+    target_rad: Finite | None = None
+    """Where it goes, from where it was armed; 0 holds that angle."""
+    target_turns: Annotated[float, Field(ge=-1e8, le=1e8, allow_inf_nan=False)] | None = None
+    """The same in turns."""
+    w_rad_s: Annotated[float, Field(ge=LEAST, le=1e6, allow_inf_nan=False)]
+    """Largest speed on the way."""
+    rate_rad_s2: Positive
+    """Largest slope."""
+    jerk_rad_s3: Positive | None = None
+    """Slope of the slope; left out: not limited."""
+    at_s: Since = 0.0
+    """When it begins."""
+
+    @model_validator(mode="after")
+    def _one_target(self) -> MoveReference:
+        if (self.target_rad is None) == (self.target_turns is None):
+            raise ValueError("give the target once, as target_rad or as target_turns")
+        return self
+
+    @property
+    def way(self) -> float:
+        """The target [rad]."""
+        return 2.0 * math.pi * self.target_turns if self.target_turns is not None else self.target_rad or 0.0
+
+
 ReferenceTable = Annotated[
-    StepReference | RampReference | SCurveReference | SineReference | TableReference,
+    StepReference | RampReference | SCurveReference | SineReference | TableReference | MoveReference,
     Field(discriminator="kind"),
 ]
 

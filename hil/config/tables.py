@@ -77,6 +77,15 @@ class RunConfig(Table):
         return self
 
     @model_validator(mode="after")
+    def _angle_within_limits(self) -> RunConfig:
+        if self.follows_angle and self.limits.following_error_rad is None and not self.loop.shadow:
+            raise ValueError(
+                "limits.following_error_rad: missing; the law position pulls the harder the further the "
+                "angle is off: say by how much it may be [rad]"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _feedback_in_time(self) -> RunConfig:
         if problem := self._seldom():
             raise ValueError(problem)
@@ -163,6 +172,11 @@ class RunConfig(Table):
     def follows_speed(self) -> bool:
         """False for a commanded torque: its speed reference means nothing."""
         return self.controller.kind not in COMMANDED
+
+    @property
+    def follows_angle(self) -> bool:
+        """Whether its law closes the loop on the angle."""
+        return bool(self.controller.kind == "position")
 
     @property
     def command(self) -> Command:

@@ -146,6 +146,14 @@ LAW_PARAMS: Final = np.dtype(
         ("k_w2", "f8"),
         ("pair", "i8"),
         ("jerk", "i8"),
+        ("k_th", "f8"),
+        ("th_w", "f8"),
+        ("th_i", "f8"),
+        ("th_u", "f8"),
+        ("th_d", "f8"),
+        ("kappa_th", "f8"),
+        ("rho_th", "f8"),
+        ("theta_span", "f8"),
     ],
     align=True,
 )
@@ -161,7 +169,8 @@ load torque that is known over the shaft's angle (:mod:`hil.control.cogging`); f
 back to the DC link (:mod:`hil.control.regen`); from ``points`` on the table of i_d* over |i_q*| of the law
 ``mtpa`` (:func:`hil.control.mtpa.by_table`); ``k_w2`` of the load that goes by the speed
 squared; ``pair``: a node's part in the law ``fac`` over two nodes (:data:`hil.control.speed.LEADS`);
-``jerk``: 1 when the reference's jerk is fed forward (:func:`hil.control.speed.slope_change`)."""
+``jerk``: 1 when the reference's jerk is fed forward (:func:`hil.control.speed.slope_change`); from ``k_th``
+on the law ``position`` (:mod:`hil.control.position`), ``k_th`` 0: no angle is followed."""
 
 _SHAPES = ("shaped", "form", "third", "g", "M", "W", "filtered", "S", "k_p", "k_i", "short", "first")
 _TABLE = ("rows", "passes", "row_q", "row_d", "row_w", "row_slew", "row_ticks")
@@ -176,6 +185,7 @@ _TABLED = ("points", "i_q_at", "i_d_at")
 _QUADRATIC = ("k_w2",)
 _PAIRED = ("pair",)
 _JERK = ("jerk",)
+_POSITION = ("k_th", "th_w", "th_i", "th_u", "th_d", "kappa_th", "rho_th", "theta_span")
 LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
     (
         *_SHAPES,
@@ -191,6 +201,7 @@ LAW_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
         *_QUADRATIC,
         *_PAIRED,
         *_JERK,
+        *_POSITION,
     ),
     0.0,
 )
@@ -249,6 +260,15 @@ LAW_STATE: Final = np.dtype(
         ("asked", "f8"),
         ("load", "f8"),
         ("slope", "f8"),
+        ("turned", "f8"),
+        ("origin", "f8"),
+        ("theta_ref", "f8"),
+        ("theta_seen", "f8"),
+        ("w_seen", "f8"),
+        ("turns", "i8"),
+        ("rounds", "i8"),
+        ("unseen", "i8"),
+        ("located", "i8"),
     ],
     align=True,
 )
@@ -259,7 +279,9 @@ rings of what was reported and what flowed, with their newest place, and how man
 adaptive window its length, its dwell, and how long the measurements ``x_last`` have stood still; i_d*, and
 whether what was asked for was capped; the measured angle of the shaft, where a load over it is known, and the
 measured DC link, where it limits; the torque of a table over k_t [A]; the torque that a
-load machine was last told to give [N m]; the reference's slope in the tick before [rad/s2]."""
+load machine was last told to give [N m]; the reference's slope in the tick before [rad/s2]; from ``turned``
+on the angle over turns [rad], where its reference is 0, that reference, the newest angle as measured and the
+speed then, whole turns and rounds of the drive's counter, ticks since then, and whether there is one."""
 
 Record = npt.NDArray[np.void]
 

@@ -1,4 +1,4 @@
-"""Reference profiles as pure functions of time: step, ramp, S-curve, sine, table.
+"""Reference profiles as pure functions of time: step, ramp, S-curve, sine, table; their integrals; moves.
 
 The value is an input of the tick and logged, so nothing here has to be the same to the bit elsewhere.
 """
@@ -132,6 +132,88 @@ def table_at(p: Any, t: float) -> tuple[float, float]:
             slope = (values[j + 1] - values[j]) / (times[j + 1] - times[j])
             return values[j] + slope * (t - times[j]), slope
     return values[count - 1], 0.0
+
+
+@jit
+def ramp_area(t: float, w: float, rate: float) -> float:
+    """Integral of :func:`ramp_at` from 0 to t."""
+    size = abs(w)
+    if t <= 0.0:
+        return 0.0
+    if rate * t >= size:
+        return float(w * (t - 0.5 * size / rate))
+    return float(math.copysign(0.5 * rate * t * t, w))
+
+
+@jit
+def s_curve_area(t: float, w: float, rate: float, jerk: float) -> float:
+    """Integral of :func:`s_curve_at` from 0 to t: after its end w (t - end / 2), it being symmetric."""
+    size = abs(w)
+    if t <= 0.0 or size == 0.0:
+        return 0.0
+    T_j = min(rate / jerk, math.sqrt(size / jerk))
+    a = jerk * T_j
+    end = size / a + T_j
+    area = size * (t - 0.5 * end)
+    if t < T_j:
+        area = jerk * t * t * t / 6.0
+    elif t < end - T_j:
+        area = a * (0.5 * t * (t - T_j) + T_j * T_j / 6.0)
+    elif t < end:
+        left = end - t
+        area += jerk * left * left * left / 6.0
+    return float(math.copysign(area, w))
+
+
+@jit
+def table_area(p: Any, t: float) -> float:
+    """Integral of :func:`table_at` from 0 to t: trapezoids."""
+    count, times, values = p["count"], p["t_table"], p["w_table"]
+    total = values[0] * min(t, times[0])
+    for j in range(count - 1):
+        length = min(t, times[j + 1]) - times[j]
+        if length > 0.0:
+            slope = (values[j + 1] - values[j]) / (times[j + 1] - times[j])
+            total += length * (values[j] + 0.5 * slope * length)
+    return float(total + values[count - 1] * max(t - times[count - 1], 0.0))
+
+
+@jit
+def turned_at(p: Any, t: float) -> float:
+    """Integral of w* from 0 to t >= 0 [rad], in closed form: of a move it ends at its way to rounding."""
+    kind = p["kind"]
+    if kind == STEP:
+        return float(p["w"] * max(t - p["at"], 0.0))
+    if kind == RAMP:
+        up = ramp_area(t - p["at"], p["w"], p["rate"])
+        return float(up - ramp_area(t - p["down_at"], p["w"], p["rate"]))
+    if kind == S_CURVE:
+        up = s_curve_area(t - p["at"], p["w"], p["rate"], p["jerk"])
+        return float(up - s_curve_area(t - p["down_at"], p["w"], p["rate"], p["jerk"]))
+    if kind == SINE:
+        omega = 2.0 * math.pi * p["frequency"]
+        swung = p["w"] / omega * (1.0 - math.cos(omega * t)) if omega > 0.0 else 0.0
+        return float(p["offset"] * t + swung)
+    return table_area(p, t)
+
+
+def move(way: float, w: float, rate: float, jerk: float, at: float) -> npt.NDArray[np.void]:
+    """A record of a move by ``way`` [rad] from rest to rest, |w*|, slope and jerk limited; jerk may be inf.
+
+    A way up of w* and the same way down |way| / w later turn by just that. It takes w there / a + T_j each
+    (:func:`s_curve_at`), so a short way has a lower w: w (w / a + T_j) = |way|.
+    """
+    size = abs(way)
+    short = math.sqrt(size * rate)
+    if math.isfinite(jerk):
+        T = rate / jerk
+        short = 0.5 * rate * (math.sqrt(T * T + 4.0 * size / rate) - T)
+        if short < rate * T:  # the slope does not reach its limit
+            short = (0.25 * size * size * jerk) ** (1.0 / 3.0)
+    w = math.copysign(min(w, short), way) if size else 0.0
+    down_at = at + (way / w if w else 0.0)
+    kind: Kind = "s-curve" if math.isfinite(jerk) else "ramp"
+    return reference(kind, w=w, at=at, down_at=down_at, rate=rate, jerk=jerk)
 
 
 @jit

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from hil.control.cogging import loaded, ripple
 from hil.control.jit import jit
+from hil.control.position import angle_error
 from hil.control.regen import braked
 from hil.control.speedfilter import enter
 
@@ -63,16 +64,18 @@ def latched(p: Any, s: Any, u: float, on: bool) -> None:
 
 @jit
 def look_ahead_speed(p: Any, s: Any) -> None:
-    """x_p = (w, i) at the tick from which the next command will act: all that act before are known."""
-    w, i, d = s["x"][0], s["inner"], s["d_hat"][0]
+    """x_p = (w, i, theta) at the tick from which the next command will act: all that act before are known."""
+    w, i, d, theta = s["x"][0], s["inner"], s["d_hat"][0], s["turned"] - s["origin"]
     for age in range(p["delay"], -1, -1):
         u = s["commands"][age]
         if loaded(p):
             d = s["d_hat"][0] + ripple(p, s, (p["delay"] - age + 0.5) * p["T_s"])
+        if p["k_th"] != 0.0:
+            theta += p["th_w"] * w + p["th_i"] * i + p["th_u"] * u + p["th_d"] * d
         w = p["Ad"][0, 0] * w + p["Bd"][0, 0] * (p["share"] * i + (1.0 - p["share"]) * u)
         w += p["Ed"][0, 0] * d
         i = p["lag"] * i + (1.0 - p["lag"]) * u
-    s["x_p"][0], s["x_p"][1] = w, i
+    s["x_p"][0], s["x_p"][1], s["x_p"][2] = w, i, theta
 
 
 @jit
@@ -97,7 +100,8 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
     With u* = (w*+ - a w* - e d) / b, what holds the reference, sigma* = w* + kappa u*, and
         u = (sigma*+ + lam (sigma - sigma*) - a sigma - e d) / g
     Without a lag (kappa = 0) it is the cascade's speed law. A load over the angle is known at each of these
-    moments: at both ends of the tick what holds against it, between them its effect.
+    moments: at both ends of the tick what holds against it, between them its effect. Of the law ``position``
+    the error of the angle goes into sigma+, too (:mod:`hil.control.position`).
     """
     look_ahead_speed(p, s)
     a, b, kappa, T_s = p["Ad"][0, 0], p["Bd"][0, 0], p["kappa"], p["T_s"]
@@ -118,6 +122,10 @@ def ask_speed(p: Any, s: Any, w_ref: float, dw_ref: float) -> None:
         drift += p["Ed"][0, 0] * ripple(p, s, lead + 0.5 * T_s)
     sigma = s["x_p"][0] + kappa * s["x_p"][1]
     wanted = after + holds + p["lam_w"] * (sigma - target - held)
+    if p["k_th"] != 0.0:
+        h = ahead * T_s
+        theta_ref = s["theta_ref"] + h * (w_ref + h * (dw_ref / 2.0 + ahead * change / 6.0))
+        wanted -= p["k_th"] * angle_error(p, s, theta_ref, held)
     u = (wanted - a * sigma - drift) / p["g_u"]
     s["i_q_ref"] = min(max(u / p["u_i"], -p["i_max"]), p["i_max"])
     if p["regen"] and p["pair"] == 0:

@@ -57,7 +57,10 @@ def wire_of_log(log: Log) -> WireFacts:
             raise ValueError(f"T_L_top is {load_top}")
         slow = tuple(_slow(one) for one in wire.get("slow", ()))
         measured = tuple(str(part) for part in wire.get("measured", ()))
-        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2], load_top, slow, measured)
+        span = float(wire.get("theta_span", 0.0))
+        if not 0.0 <= span < math.inf:
+            raise ValueError(f"theta_span is {span}")
+        return WireFacts(steps[0], steps[1], modulus, x_lsb, steps[2], load_top, slow, measured, span)
     except _UNUSABLE as error:
         raise HilError(f"{log.path}: has no usable wire facts in it ({error})") from error
 

@@ -94,6 +94,11 @@ def other_machine(log: Log, config: RunConfig) -> Machine:
             f"{log.path}: controller.kind {config.controller.kind}: half of one law over two nodes, and this "
             "log is of no run under it: it does not say what each told the other"
         )
+    if machine.law["k_th"][0] and not logged_law["k_th"][0]:
+        raise HilError(
+            f"{log.path}: controller.kind {config.controller.kind} follows an angle, and this log is of a "
+            "law that has none for a reference"
+        )
     if FAC in (int(machine.law["kind"][0]), int(logged_law["kind"][0])):
         raise HilError(f"{log.path}: controller.kind fac commands a load torque that no log says was applied")
     return machine.fresh()

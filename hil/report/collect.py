@@ -16,6 +16,7 @@ from hil.errors import ConfigError, HilError
 from hil.log.ahead import ahead
 from hil.log.reader import Block, Log, Source, new_log, read_blocks
 from hil.replay import Replay, Verdict, machine_of
+from hil.report.angles import Angles
 from hil.report.curves import CURVES, F4, F8, limit_lines, values_of
 from hil.report.envelope import CloseUps, Envelope, merged
 from hil.report.excursions import Excursions
@@ -45,6 +46,7 @@ class Run:
     spectrum: Spectrum = field(default_factory=Spectrum)
     responses: Responses = field(default_factory=Responses)
     excursions: Excursions = field(default_factory=Excursions)
+    angles: Angles = field(default_factory=Angles)
     frames: Frames = field(default_factory=Frames)
     envelope: Envelope = field(default_factory=lambda: Envelope(len(CURVES)))
     close_ups: CloseUps = field(default_factory=CloseUps)
@@ -82,6 +84,7 @@ class Run:
         self.close_ups.feed(t, values, sorted(steps + ends))
         self.totals.feed(t, ticks)
         self.excursions.feed(t, ticks)
+        self.angles.feed(t, ticks)
         if self.stop is None and ticks["reason"].any():
             self.stop = ticks[int(np.argmax(ticks["reason"] != 0))].copy()
         self.phases.feed(ticks)

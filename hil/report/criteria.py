@@ -31,12 +31,16 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure of a run: key, what it is called, its unit, how it is read (None for no data)."""
+    """A figure of a run: key, what it is called, its unit, how it is read (None for no data).
+
+    ``special``: of few laws, shown where there is one.
+    """
 
     key: str
     name: str
     unit: str
     of: Callable[[Run], float | None]
+    special: bool = False
 
 
 def _worst(name: str) -> Callable[[Run], float | None]:
@@ -79,6 +83,11 @@ def notes(run: Run) -> dict[str, str]:
     return dict.fromkeys(("dip_rad_s", "recovery_s"), text)
 
 
+def _angle(name: str) -> Callable[[Run], float | None]:
+    """A figure of how an angle was followed."""
+    return lambda run: getattr(run.angles, name)
+
+
 def _lateness(name: str) -> Callable[[Run], float | None]:
     return lambda run: run.phases.lateness.as_dict()[name] if run.totals.ticks else None
 
@@ -110,6 +119,9 @@ FIGURES: Final = (
     Figure("estimate_error_n_m", "load estimate off N ticks after a step", "N m", _worst("estimate_error")),
     Figure("ripple_rad_s", "speed ripple at rest, rms", "rad/s", _worst("ripple")),
     Figure("iae_rad", "integral of |w − w*|", "rad", _followed("iae")),
+    Figure("angle_error_rms_rad", "following error of the angle, rms", "rad", _angle("rms"), True),
+    Figure("angle_error_peak_rad", "largest following error of the angle", "rad", _angle("peak"), True),
+    Figure("angle_settling_s", "settling to 0.01 rad after the last move", "s", _angle("settling_s"), True),
     Figure("skipped", "periods skipped", "", lambda run: run.totals.skipped),
     Figure("dropped", "records dropped", "", _result("dropped_ticks")),
     Figure("lost_feedback", "ticks in operation without fresh feedback", "", lambda run: run.totals.lost),

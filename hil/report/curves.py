@@ -74,6 +74,8 @@ DERIVED: Final = {"error": (Curve("error", "w − w*", _error),), "bus": (Curve(
 HEADS: Final = (
     Plot("speed", "Speed and reference", "rad/s"),
     Plot("error", "Speed error in operation", "rad/s"),
+    Plot("angle", "Angle and reference, from where it was armed", "rad"),
+    Plot("angle_error", "Following error of the angle", "rad"),
     Plot("current", "Currents", "A"),
     Plot("voltage_q", "q voltage: asked by the law, sent, applied", "V", held=True),
     Plot("voltage_d", "d voltage: asked by the law, sent, applied", "V", held=True),
@@ -154,6 +156,7 @@ def limit_lines(config: RunConfig | None, windows: tuple[int, ...]) -> dict[str,
 
     return {
         "speed": both(limits.w_max_rad_s, "trip"),
+        **({"angle_error": both(limits.following_error_rad, "trip")} if limits.following_error_rad else {}),
         "current": both(limits.i_max_a, "i_max") + both(limits.i_trip_a, "trip"),
         "voltage_q": both(config.command.most, "u_max"),
         "voltage_d": both(config.command.most, "u_max"),

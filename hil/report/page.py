@@ -142,6 +142,8 @@ def metrics(runs: Sequence[Run]) -> str:
     rows = []
     for figure in FIGURES:
         own = [value[figure.key] for value in values]
+        if figure.special and not any(value is not None for value in own):
+            continue
         cells = [number(value, figure.unit) for value in own]
         cells += [_difference(own[base], own[index], figure.unit) for base, index in pairs]
         rows.append((escape(figure.name), *map(escape, cells)))

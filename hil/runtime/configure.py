@@ -219,7 +219,9 @@ def _known(job: Job, sdo: Sdo) -> None:
 
 def _scales(job: Job, sdo: Sdo) -> Scales:
     """Every unit, asked before anything is changed."""
-    scales = Scales(sdo, Said(job.table.velocity_unit, job.table.rated_current or ""))
+    scales = Scales(
+        sdo, Said(job.table.velocity_unit, job.table.rated_current or "", job.table.position_unit)
+    )
     for pdo in job.plan.pdos:
         for one in pdo.objects:
             scales.of(one.place.index)

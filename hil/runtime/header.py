@@ -75,6 +75,7 @@ def header_of(setup: Setup, kind: str, clock: str) -> dict[str, Any]:
                     **({"T_L_top": setup.wire.T_L_top} if math.isfinite(setup.wire.T_L_top) else {}),
                     "slow": [asdict(message) for message in setup.wire.slow],
                     "measured": setup.wire.measured,
+                    **({"theta_span": setup.wire.theta_span} if setup.wire.theta_span else {}),
                 }
             ),
             **origin(),

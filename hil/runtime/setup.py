@@ -81,7 +81,17 @@ def wire_facts(binding: Binding) -> WireFacts:
             if bound.has(MEASURED)
             for part, _ in bound.parts
         ),
+        theta_span=angle_span(binding.signal("angle")),
     )
+
+
+def angle_span(angle: Signal | None) -> float:
+    """What the angle's counter counts until it begins anew [rad]; 0 for whole turns, and for a float."""
+    if angle is None or angle.is_float:
+        return 0.0
+    span = angle.raw_count * angle.step
+    turns = span / (2.0 * math.pi)
+    return 0.0 if abs(turns - round(turns)) < 0.01 and round(turns) else span
 
 
 def _step(signal: Signal | None) -> float:
@@ -138,6 +148,7 @@ def setup_of(path: Path, config: RunConfig, read: Callable[..., Database] = Data
     _check_command(path, config)
     carried = {config.command.keys[0]: wire.u_top} | ({"T_L_max_n_m": wire.T_L_top} if load else {})
     check_limits(str(path), config.limits, shown, carried)
+    _check_angle(path, config, wire)
     machine = build(config, wire)
     if config.drive.takes != "voltage":
         refuse_unstable(str(path), config, machine, wire.x_lsb[0])
@@ -162,6 +173,18 @@ def _check_command(path: Path, config: RunConfig) -> None:
         asked = " or ".join(laws()[kind].takes)
         raise ConfigError(
             str(path), [f"controller.kind: {kind} asks for a {asked}, the drive takes a {takes}; take {fit}"]
+        )
+
+
+def _check_angle(path: Path, config: RunConfig, wire: WireFacts) -> None:
+    """An angle that is to be followed is one of the shaft, over a turn at least. Raises ConfigError."""
+    if config.follows_angle and 0.0 < wire.theta_span < 2.0 * math.pi:
+        raise ConfigError(
+            str(path),
+            [
+                f"drive.signals.angle: its frames show {wire.theta_span:.4g} rad, less than a turn; name the "
+                "shaft's mechanical angle, or correct its unit in drive.signals.units"
+            ],
         )
 
 

@@ -1,4 +1,4 @@
-"""Ticks as one plain array a field: what a figure reads of a record is a few of its 403 bytes.
+"""Ticks as one plain array a field: what a figure reads of a record is a few of its bytes.
 
 Filled in compiled code while the records are still near; the same arrays serve one run after the other.
 """
@@ -17,7 +17,7 @@ APART: Final = 8
 """Rows that stay unused: columns a power of two apart share few places of the processor's nearest memory."""
 RING: Final = 128
 """Records that are written in turn: few, so that they stay in the processor's nearest memory."""
-FLOATS: Final = ("w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat")
+FLOATS: Final = ("w", "w_ref", "dw_ref", "i_q", "i_d", "u_q", "u_d", "T_L_true", "T_L_hat", "theta_error")
 INTEGERS: Final = ("k", "state", "reason", "rx_flags", "guard_flags", "skipped", "gap")
 
 
@@ -29,7 +29,7 @@ def gather(ticks: Any, floats: Any, integers: Any, at: int) -> None:
         floats[0, i], floats[1, i], floats[2, i] = t["w"], t["w_ref"], t["dw_ref"]
         floats[3, i], floats[4, i] = t["i_q"], t["i_d"]
         floats[5, i], floats[6, i] = t["u_q"], t["u_d"]
-        floats[7, i], floats[8, i] = t["T_L_true"], t["T_L_hat"]
+        floats[7, i], floats[8, i], floats[9, i] = t["T_L_true"], t["T_L_hat"], t["theta_error"]
         integers[0, i], integers[1, i], integers[2, i] = t["k"], t["state"], t["reason"]
         integers[3, i], integers[4, i] = t["rx_flags"], t["guard_flags"]
         integers[5, i], integers[6, i] = t["skipped"], t["gap"]

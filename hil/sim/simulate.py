@@ -10,7 +10,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Final
 
@@ -239,9 +239,11 @@ def simulation_of(setup: Setup, plant: PlantConfig, wire: Wire) -> Simulation:
         raise ConfigError(str(setup.path), ["loop.duration_s: missing; a simulation must end"])
     if plant.fault:
         raise ConfigError(str(setup.path), ["fault: a fault script needs the bus; use hil run or hil faults"])
+    every = plant.feedback_every
+    if plant.protocol == "cia402":  # it measures, and rounds its torque, as it is set
+        every, wire = setup.config.feedback_every, replace(wire, i_q_lsb=setup.wire.x_lsb[1])
     params = build_params(plant, wire)
     state = new_state(params, setup.wire.counter_modulus - 1)
-    every = setup.config.feedback_every if plant.protocol == "cia402" else plant.feedback_every
     return Simulation(setup, params, state, ticks, setup.machine.fresh(), every)
 
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from hil.control.cogging import MOST_ANGLE
 from hil.control.jit import jit
 from hil.signals import DriveState, GuardFlag, Reason, RxFlag
 
@@ -60,6 +61,8 @@ SAFETY_PARAMS: Final = np.dtype(
         ("u_i", "f8"),
         ("absent", "i8"),
         ("scheduled", "i8"),
+        ("theta_error_max", "f8"),
+        ("theta_jump", "f8"),
     ],
     align=True,
 )
@@ -70,7 +73,8 @@ of the drive's map, whose age may be ``age_max`` periods; ``carried_by``: what v
 temperature come with, as bits of ``came``, 0 for what the drive does not send. ``k_u``: torque per unit of
 the command of a drive that takes a current or a torque, ``u_i`` that unit per ampere; 0 for voltages.
 ``absent``: what the drive does not report, NO_I_Q, NO_I_D and NO_ANGLE. ``scheduled``: ticks from one
-measurement to the next that have none, as planned; hold times begin after them.
+measurement to the next that have none, as planned; hold times begin after them. ``theta_error_max`` [rad] and
+``theta_jump`` [rad] are of a law that follows an angle, ``theta_jump`` 0 of all others.
 """
 NO_I_Q: Final = 1
 NO_I_D: Final = 2
@@ -82,7 +86,19 @@ MOST_PERIODS: Final = 1024
 """Periods since the last measurement that are still counted; no run in operation waits so long."""
 
 SAFETY_NEUTRAL: Final[dict[str, float]] = dict.fromkeys(
-    ("rules", "messages", "age_max", "carried_by", "k_u", "u_i", "absent", "scheduled"), 0
+    (
+        "rules",
+        "messages",
+        "age_max",
+        "carried_by",
+        "k_u",
+        "u_i",
+        "absent",
+        "scheduled",
+        "theta_error_max",
+        "theta_jump",
+    ),
+    0,
 )
 """Parameters newer than log format 1, each with the value that means "as before it was there".
 
@@ -130,6 +146,7 @@ SAFETY_STATE: Final = np.dtype(
         ("age", "i8", 8),
         ("stale_at", "i8"),
         ("i_d_ref", "f8"),
+        ("slip", "f8"),
     ],
     align=True,
 )
@@ -137,7 +154,8 @@ SAFETY_STATE: Final = np.dtype(
 
 ``elapsed``: periods since the last measurement that was judged; ``gap``: of this tick; ``came``: slow
 messages that have come once, and MEASURED; ``age``: of each [periods]; ``stale_at``: ``stale`` when the stop
-began; ``i_d_ref``: what i_d was last to follow, which a stop leaves.
+began; ``i_d_ref``: what i_d was last to follow, which a stop leaves; ``slip`` [rad]: what the measured angle
+lately moved by and the speed did not tell.
 """
 
 OVER_SPEED: Final = 0
@@ -146,6 +164,7 @@ OVER_TEMPERATURE: Final = 2
 UNDER_VOLTAGE: Final = 3
 OVER_VOLTAGE: Final = 4
 FOLLOWING: Final = 5
+FOLLOWING_ANGLE: Final = 6
 
 
 @jit
@@ -253,6 +272,8 @@ def all_numbers(p: Any, s: Any, t: Any) -> bool:
         return False
     if sent(p, s, 2) and not math.isfinite(t["temperature_inverter"]):
         return False
+    if p["theta_jump"] > 0.0 and not abs(t["theta"]) < MOST_ANGLE:
+        return False
     if p["rules"] == 0 or not p["shadow"]:
         return True
     return bool(math.isfinite(t["u_q_seen"]) and math.isfinite(t["u_d_seen"]))
@@ -277,6 +298,8 @@ def judge_measurement(p: Any, s: Any, t: Any) -> int:
     """
     if not all_numbers(p, s, t):
         return Reason.NOT_A_NUMBER.value
+    if p["theta_jump"] > 0.0 and abs(s["slip"]) > p["theta_jump"]:
+        return Reason.ANGLE_JUMP.value
     ticks = p["trip_ticks"]
     i_q, i_d = currents(p, s, t)
     i_squared = i_q * i_q + i_d * i_d

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hil.control.cogging import flows, known_load, loaded
+from hil.control.cogging import MOST_ANGLE, flows, known_load, loaded
 from hil.control.jit import array_at, jit
 from hil.control.law import (
     LAW_PARAMS,
@@ -27,6 +27,7 @@ from hil.control.law import (
     reset,
     to_circle,
 )
+from hil.control.position import locate
 from hil.control.references import REFERENCE
 from hil.control.speed import LEADS, flowed, latched
 from hil.signals import Controlword, DriveState, GuardFlag, Reason, RxFlag
@@ -106,12 +107,30 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 
 
 @jit
+def estimate_angle(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
+    """The angle over turns and its following error; until operation its reference begins where the shaft is.
+
+    What is no angle is left to the guard, as what it jumps by is: ``slip`` forgets a tenth of it a tick.
+    """
+    ls["unseen"] += t["gap"]
+    if t["rx_flags"] & RxFlag.FRESH and abs(t["theta"]) < MOST_ANGLE:
+        s["slip"] = 0.9 * s["slip"] + locate(lp, ls, t["theta"])
+    if s["reason"] == 0 and s["state"] != DriveState.OPERATION_ENABLED:
+        ls["origin"] = ls["turned"] - t["theta_ref"]
+    ls["theta_ref"] = t["theta_ref"]
+    t["theta_turned"] = ls["turned"] - ls["origin"]
+    t["theta_error"] = t["theta_ref"] - t["theta_turned"]
+
+
+@jit
 def estimate(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """Advance the observer by the past periods; a measurement that is not finite is no measurement."""
     if lp["cogs"] and t["rx_flags"] & RxFlag.FRESH:
         ls["theta"] = t["theta"]
     if lp["kind"] == SPEED:
         estimate_speed(p, s, lp, ls, t)
+        if lp["k_th"] != 0.0:
+            estimate_angle(p, s, lp, ls, t)
         return
     fresh = (t["rx_flags"] & RxFlag.FRESH) != 0
     finite = math.isfinite(t["w"]) and math.isfinite(t["i_q"]) and math.isfinite(t["i_d"])

@@ -126,7 +126,7 @@ def _drive(p: Any, s: Any, t: Any) -> str:
 
 
 _TEMPERATURES: Final = ("temperature_motor", "temperature_inverter")
-_MEASURED: Final = ("w", "i_q", "i_d", "v_dc", *_TEMPERATURES)
+_MEASURED: Final = ("w", "i_q", "i_d", "theta", "v_dc", *_TEMPERATURES)
 
 CAUSES: Final[dict[Reason, Cause]] = {
     Reason.STOP_REQUESTED: Cause(
@@ -225,6 +225,15 @@ CAUSES: Final[dict[Reason, Cause]] = {
         "look at load, voltage (is the law saturated before?) and encoder; slow the reference down",
         "limits.following_error_rad_s", "rad/s",
         lambda p, s, t: abs(float(t["w_ref"]) - float(t["w"])), _limit("w_error_max"), _flags),
+    Reason.ANGLE_ERROR: Cause(
+        "the angle is too far off its reference for following_error_s",
+        "look at load and current (is the law saturated before?); slow the move down",
+        "limits.following_error_rad", "rad",
+        lambda p, s, t: abs(float(t["theta_error"])), _limit("theta_error_max"), _flags),
+    Reason.ANGLE_JUMP: Cause(
+        "the measured angle moved by what the speed does not tell",
+        "look at the encoder, its cable and its resolution, and at the angle's unit and sign",
+        "", "rad", _state("slip"), _limit("theta_jump")),
     Reason.CURRENT_UNCONTROLLED: Cause(
         "i_d is far from its reference, 0 for most laws, most of the time",
         "look for an open phase or a wrong rotor angle",

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from hil.control.jit import jit
 from hil.control.law import FAC
-from hil.control.references import reference_at
+from hil.control.references import reference_at, turned_at
 from hil.control.speed import FOLLOWS, LEADS
 from hil.signals import DriveState, Request
 
@@ -49,11 +49,15 @@ SETPOINT_STATE: Final = np.dtype(
         ("at_zero", "i8"),
         ("w_from", "f8"),
         ("i_q_from", "f8"),
+        ("theta", "f8"),
+        ("theta_base", "f8"),
+        ("own", "i8"),
     ],
     align=True,
 )
 """Newest references; live targets and whether there are any; of the ramp: ticks since its begin and since the
-reference is 0, and the references that it began with."""
+reference is 0, and the references that it began with; the reference angle, what it is ahead of the profile's
+own, and whether the profile gave it."""
 
 Record = npt.NDArray[np.void]
 
@@ -105,6 +109,20 @@ def ramp_over(p: Any, g: Any, w_ref: float, measured: float, gap: int) -> bool:
 
 
 @jit
+def turned(rp: Any, p: Any, g: Any, time: float, w: float, gap: int) -> float:
+    """theta* [rad], the integral of w*: the profile's in closed form, elsewhere trapezoids of ``gap`` ticks.
+
+    The profile's goes on from where the other left it, so theta* never jumps.
+    """
+    profile, own = not (g["ramping"] or g["live_w"]), turned_at(rp, time)
+    if not (profile and g["own"]):
+        g["theta_base"] = g["theta"] + 0.5 * p["T_s"] * gap * (g["w"] + w) - own
+    g["own"] = int(profile)
+    g["theta"] = g["theta_base"] + own
+    return float(g["theta"])
+
+
+@jit
 def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
     """Write the reference of this tick; the profile's time begins when operation is enabled.
 
@@ -112,7 +130,8 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
     gs``: parameters and state of this module; ``ss, lp``: the supervisor's state, the law's parameters.
     """
     t, s, p, g = ticks[0], ss[0], gp[0], gs[0]
-    w_ref, dw_ref = reference_at(rp[0], s["run_ticks"] * lp[0]["T_s"])
+    time = s["run_ticks"] * lp[0]["T_s"]
+    w_ref, dw_ref = reference_at(rp[0], time)
     pair = lp[0]["pair"]
     i_q = rp[0]["i_q"] if lp[0]["kind"] == FAC or pair == LEADS else 0.0
     w_ref, dw_ref, i_q = follow(p, g, w_ref, dw_ref, i_q, t["gap"])
@@ -126,6 +145,8 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
         over = ramp_over(p, g, w_ref, t["w"], t["gap"])
         if orderly and not over:
             t["request"] = Request.RAMP_DOWN.value
+    if lp[0]["k_th"] != 0.0:
+        t["theta_ref"] = turned(rp[0], p, g, time, w_ref, t["gap"])
     g["w"], g["i_q"] = w_ref, i_q
     t["w_ref"], t["dw_ref"] = w_ref, dw_ref
     if pair != FOLLOWS:  # else another node's law has written it

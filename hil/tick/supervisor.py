@@ -10,7 +10,7 @@ from typing import Any
 
 from hil.control.jit import jit
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
-from hil.tick.guard import FOLLOWING, MEASURED, elapse, grown, judge_measurement, persists
+from hil.tick.guard import FOLLOWING, FOLLOWING_ANGLE, MEASURED, elapse, grown, judge_measurement, persists
 
 STOP_TICKS = 20
 """Ticks for which the stop frames are repeated before the run ends."""
@@ -126,7 +126,7 @@ def judge_echo(p: Any, s: Any, t: Any) -> int:
 
 @jit
 def judge_following(p: Any, s: Any, t: Any) -> int:
-    """Return the Reason once speed or i_d has been off its reference by more than allowed for too long.
+    """Return the Reason once speed, angle or i_d has been off its reference by too much for too long.
 
     i_d follows i_d*, 0 for most laws. With a phase open the current stays on one stator axis, so that
     tan theta = i_d/i_q while the rotor turns by theta: |i_d| > |i_q|/3 in 80 % of the ticks, at any load
@@ -143,6 +143,10 @@ def judge_following(p: Any, s: Any, t: Any) -> int:
     s["uncontrolled"] = s["uncontrolled"] + periods if far else max(0, s["uncontrolled"] - periods)
     if s["uncontrolled"] >= p["w_error_ticks"]:
         return Reason.CURRENT_UNCONTROLLED.value
+    if p["theta_jump"] > 0.0:
+        astray = abs(t["theta_error"]) > p["theta_error_max"]
+        if persists(s, FOLLOWING_ANGLE, astray, p["w_error_ticks"]):
+            return Reason.ANGLE_ERROR.value
     return Reason.FOLLOWING_ERROR.value if lost else Reason.NONE.value
 
 

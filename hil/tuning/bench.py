@@ -199,11 +199,12 @@ def _own_loop(setup: Setup, spread: dict[str, float]) -> dict[str, Any]:
 
     The observer knows how a command was rounded: that is no noise to it.
     """
-    config = setup.config
+    config, angle = setup.config, setup.binding.signal("angle")
     return {
         "inner": spec_in(setup).inner,
         "filter": speed_filter(config.drive.speed_filter, config.loop.rate_hz),
         "unit": config.command.unit,
+        "theta_noise": angle.step / math.sqrt(12.0) if config.follows_angle and angle else None,
         "spread": {name: spread.get(name, 0.0) for name in ("J", "psi_f")},
     }
 

@@ -24,6 +24,7 @@ from hil.tuning.loop import (
     LOAD,
     NO_LIMIT,
     PULSE_I,
+    PULSE_TH,
     PULSE_U,
     PULSE_W,
     Plant,
@@ -133,12 +134,14 @@ def respond_current(
 ) -> None:
     """The response from rest; ``out`` (4, K): command, reported speed, w, d_hat from then on.
 
-    It begins with a measurement. Not ``closed``, the observer alone: no command reaches the drive.
+    The angle, which the law position follows to 0, is the trapezoids of w. It begins with a measurement. Not
+    ``closed``, the observer alone: no command reaches the drive.
     """
     n, K, every = A.shape[0], out.shape[1], max(p["every"], 1)
     x, new, way = np.zeros(n), np.zeros(n), np.zeros(COMMANDS)
     reset(s)
     latched(p, s, 0.0, False)
+    s["turned"] = 0.0
     for k in range(-QUIET * every, K):
         fresh = k % every == 0
         y = 1.0 if kind == PULSE_W and k == 0 else 0.0
@@ -150,7 +153,10 @@ def respond_current(
         if not fresh:
             between(p, s)
         latched(p, s, way[0], True)
+        pulse = 1.0 if kind == PULSE_TH and k == 0 else 0.0
+        s["turned"] += pulse
         ask(p, s, 0.0, 0.0, 0.0, NO_LIMIT)
+        s["turned"] -= pulse
         acts = way[p["delay"]] + (1.0 if kind == PULSE_U and k == 0 else 0.0)
         load = 1.0 if kind == LOAD and k >= 0 else 0.0
         if k >= 0:
@@ -158,7 +164,9 @@ def respond_current(
         for age in range(p["delay"], 0, -1):
             way[age] = way[age - 1]
         way[0] = s["u"][1] if closed else 0.0
+        before = x[0]
         step(A, b, e, acts, load, x, new)
+        s["turned"] += 0.5 * p["T_s"] * (before + x[0])
 
 
 @jit

@@ -187,10 +187,13 @@ FAMILIES: Final[dict[str, Family]] = {
 
 
 def _speed(channel: Callable[[float, Bench], dict[str, Any]]) -> Callable[[Sequence[float], Bench], Tables]:
-    """The law ``speed`` over one window, of x[1] samples."""
+    """The law ``speed`` over one window, of x[1] samples; or ``position``, its poles in a fixed ratio."""
 
     def tables(x: Sequence[float], bench: Bench) -> Tables:
-        controller = {"kind": "speed", "speed_pole_rad_s": round(float(x[0]) / bench.T_s, 2)}
+        pole = round(float(x[0]) / bench.T_s, 2)
+        controller = {"kind": "speed", "speed_pole_rad_s": pole}
+        if bench.theta_noise is not None:
+            controller |= {"kind": "position", "position_pole_rad_s": round(POSITION_SHARE * pole, 2)}
         return {"controller": controller, "speed": channel(x[1], bench)}
 
     return tables
@@ -211,6 +214,8 @@ def _of_speed(
     return Family(law, FAMILIES[law].doc, bounds, tables, (1,) if window else (), own_loop=True)
 
 
+POSITION_SHARE: Final = 1.0 / 3.0
+"""Pole of the angle over that of the speed."""
 _SPEED_POLE: Final = (0.002, 0.4)
 OWN_LOOP: Final[dict[str, Family]] = {
     family.law: family

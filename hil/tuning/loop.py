@@ -18,8 +18,9 @@ from hil.control.law import MotorModel, apply, command, observe, reset
 from hil.control.linalg import Array
 
 Record = npt.NDArray[np.void]
-LOAD, PULSE_W, PULSE_I, PULSE_U = range(4)
-"""What disturbs the loop: a unit step of the load, a unit pulse on a measurement or on the voltage."""
+LOAD, PULSE_W, PULSE_I, PULSE_U, PULSE_TH = range(5)
+"""What disturbs the loop: a unit step of the load, a unit pulse on a measurement or on the voltage;
+the last of a law that follows an angle."""
 QUIET: Final = 3
 """Ticks at rest before it, at least: the observer's memory is filled by then."""
 NO_LIMIT: Final = 1e300

@@ -27,6 +27,7 @@ from hil.tuning.current import Regulator, respond_each, shaft_of
 from hil.tuning.loop import (
     LOAD,
     PULSE_I,
+    PULSE_TH,
     PULSE_U,
     PULSE_W,
     Plant,
@@ -61,6 +62,7 @@ Place = tuple[MotorModel, Elastic | None]
 _MODES: Final[tuple[Literal["short", "N"], ...]] = ("short", "N")
 _STEP, _OWN_STEP = np.array([LOAD, PULSE_U]), np.array([LOAD, PULSE_W])
 _NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U])
+_ANGLE_NOISE: Final = np.array([PULSE_W, PULSE_I, PULSE_U, PULSE_TH])
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +99,8 @@ class Bench:
     unit: str = "V"
     known: Elastic | None = None
     regulator: Regulator | None = None
+    theta_noise: float | None = None
+    """Deviation of the angle's steps [rad], of the law position; None: of a law that follows no angle."""
 
     @property
     def every(self) -> int:
@@ -279,8 +283,10 @@ def noise(
     law, motor, ticks = held(law, "N"), motor or bench.motor, ticks or bench.ticks
     if bench.inner is None:
         return _coupled_noise(turning_responses(law, bench, motor, at, ticks), bench)
-    out = responses(law, [bench.plant(motor, at)], _NOISE, ticks)[0][:, (0, 2)]
-    sigma = np.array([bench.w_noise, bench.i_noise * bench.inner.u_i, bench.u_noise])
+    kinds = _NOISE if bench.theta_noise is None else _ANGLE_NOISE
+    out = responses(law, [bench.plant(motor, at)], kinds, ticks)[0][:, (0, 2)]
+    every = (bench.w_noise, bench.i_noise * bench.inner.u_i, bench.u_noise, bench.theta_noise or 0.0)
+    sigma = np.array(every[: len(kinds)])
     u, w = np.sqrt((sigma[:, None] ** 2 * (out**2).sum(axis=2) / bench.every).sum(axis=0))
     return float(u), float(w)
 

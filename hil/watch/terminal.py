@@ -56,13 +56,13 @@ def lines(fields: Sequence[Field] = FIELDS) -> list[Field]:
 
 
 def curves(ticks: TickArray, width: int, fields: Sequence[Field] = FIELDS) -> Table:
-    """One row a signal: newest value, sparkline, smallest and largest."""
+    """One row a signal that has numbers: newest value, sparkline, smallest and largest."""
     table = Table.grid(padding=(0, 1))
     for justify in ("left", "right", "left", "left", "right"):
         table.add_column(justify=justify, no_wrap=True)
     for field, colour in zip(lines(fields), cycle(COLOURS)):
         values = ticks[field.name].astype(np.float64) * field.scale
-        if len(values):
+        if len(values) and not np.isnan(values).all():
             line = Text(sparkline(values, max(10, width - 56), field.shown.span), style=colour)
             ends = Text(f"{values.min():z.2f} .. {values.max():z.2f}", style="dim")
             unit = Text(field.drawn_unit, style="dim")

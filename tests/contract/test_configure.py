@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 from canopen import SdoAbortedError
 
 from drivers.errors import DatabaseError, NodeError
+from drivers.scales import Said, Scale, Scales
 from hil.check.checks import canopen_rows
 from hil.cli import main
 from hil.errors import ConfigError, HilError
@@ -159,6 +162,60 @@ def test_more_objects_by_name_with_their_units(configs: Path, channel: str) -> N
         ("DcLinkVoltage", 0.001, "V"),
     ]
     assert result.units["rated_current"] == "4 A peak (6075h)"
+
+
+def test_the_angle_has_the_turn_that_the_drive_tells(configs: Path, channel: str) -> None:
+    with emulated(configs, channel):
+        result = set_up(configs, channel, 'canopen.tpdo=[["6041", "606C", "6077"], ["6064"]]')
+    second = cantools.database.load_file(configs / "drives" / "cia402.dbc").get_message_by_name("TPDO2")
+    assert [(s.name, s.scale, s.unit) for s in second.signals] == [("Position", 1.0 / 4096, "rev")]
+    assert result.units["unit_of_angle"] == "0.000244141 rev (608Fh)"
+
+
+class Told:
+    """A node that has these objects alone."""
+
+    node_id = NODE
+
+    def __init__(self, objects: dict[tuple[int, int], int]) -> None:
+        self._objects = objects
+
+    def optional_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
+        return self._objects.get((index, sub))
+
+
+COUNTED = {(0x608F, 1): 10_000, (0x608F, 2): 1}
+
+
+@pytest.mark.parametrize(
+    ("objects", "said", "scale"),
+    [
+        ({}, "", None),
+        ({}, "1/3000 rev", Scale(Fraction(1, 3000), "rev")),
+        (COUNTED, "", Scale(Fraction(1, 10_000), "rev")),
+        (COUNTED | {(0x6091, 1): 5, (0x6091, 2): 1}, "", None),
+        (COUNTED | {(0x6091, 1): 5, (0x6091, 2): 1}, "1/50000 rev", Scale(Fraction(1, 50_000), "rev")),
+        (COUNTED | {(0x6091, 1): 1, (0x6091, 2): 1}, "0.0001 rev", Scale(Fraction(1, 10_000), "rev")),
+        ({(0x60A8, 0): 0xFD410000}, "", Scale(Fraction(1, 1000), "deg")),
+        ({(0x608F, 1): 0, (0x608F, 2): 1}, "", None),
+    ],
+)
+def test_what_an_angle_counts_in(objects: dict[tuple[int, int], int], said: str, scale: Scale | None) -> None:
+    told: Any = Told(objects)
+    assert Scales(told, Said(position_unit=said)).of(0x6064) == scale
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        ("1/4096 rev", 'canopen.position_unit = "1/4096 rev", but 608Fh says 0.0001 rev; leave the key out'),
+        ("counts", 'canopen.position_unit = "counts": give a unit of rad, rev, deg'),
+    ],
+)
+def test_an_angle_that_is_said_otherwise_is_refused(said: str, words: str) -> None:
+    told: Any = Told(COUNTED)
+    with pytest.raises(DatabaseError, match=re.escape(words)):
+        Scales(told, Said(position_unit=said)).of(0x6064)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from drivers.client import DriveClient
 from drivers.codec import Database
 from drivers.errors import DatabaseError, EncodeError
 from drivers.mapping import house_map
-from drivers.units import CELSIUS, CURRENT, SPEED, TORQUE, VOLTAGE, unit_of
+from drivers.units import ANGLE, CELSIUS, CURRENT, SPEED, TORQUE, VOLTAGE, unit_of
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import new_ticks
 from tests.conftest import CONFIGS
@@ -41,6 +41,7 @@ def rpm(unit: str) -> tuple[str, str]:
         ("V", VOLTAGE, 1.0), ("Volts", VOLTAGE, 1.0), ("mV", VOLTAGE, 1e-3), ("kV", VOLTAGE, 1e3),
         *((unit, CELSIUS, 1.0) for unit in ("degC", "deg C", "°C", "Â°C", "ºC", "℃", "C", "Celsius")),
         *((unit, TORQUE, 1.0) for unit in ("N m", "Nm", "N*m", "N·m", "N-m", "NM")), ("mNm", TORQUE, 1e-3),
+        ("1/4096 rev", ANGLE, 2 * math.pi / 4096), ("1/10000 rev", ANGLE, 2 * math.pi / 10_000),
     ],
 )  # fmt: skip
 def test_units_as_people_write_them(text: str, units: Any, factor: float) -> None:
@@ -51,7 +52,8 @@ def test_units_as_people_write_them(text: str, units: Any, factor: float) -> Non
 @pytest.mark.parametrize(
     ("text", "units"),
     [("", SPEED), ("Hz", SPEED), ("1/s", SPEED), ("MA", CURRENT), ("MV", VOLTAGE), ("MNm", TORQUE),
-     ("K", CELSIUS), ("%", CURRENT), ("Vrms", VOLTAGE)],
+     ("K", CELSIUS), ("%", CURRENT), ("Vrms", VOLTAGE),
+     ("counts", ANGLE), ("inc", ANGLE), ("1/0 rev", ANGLE), ("1/4096", ANGLE)],
 )  # fmt: skip
 def test_units_that_could_be_two_are_none(text: str, units: Any) -> None:
     assert unit_of(text, units) is None

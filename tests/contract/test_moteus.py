@@ -277,7 +277,7 @@ class Drive:
         }  # fmt: skip
         self.sample: Any = {
             "w": 80.0, "i_q": -2.5, "i_d": 0.5, "v_dc": 541.0, "temperature_motor": 31.0,
-            "temperature_inverter": 26.0,
+            "temperature_inverter": 26.0, "theta": 7.0,
         }  # fmt: skip
         self.commands: list[tuple[int, float, float]] = []
 
@@ -302,6 +302,7 @@ def test_what_the_emulated_drive_answers_is_read_by_the_maker() -> None:
     assert (said[R.MODE], said[R.FAULT], said[R.VOLTAGE]) == (10, 0, 541.0)
     assert said[R.VELOCITY] == pytest.approx(80.0 / (2 * math.pi), rel=1e-7)
     assert (said[R.Q_CURRENT], said[R.D_CURRENT], said[R.TORQUE]) == (-2.5, 0.5, -9.0)
+    assert said[R.POSITION] == pytest.approx(7.0 / (2 * math.pi), rel=1e-7), "turns, over one"
     take(frames, drive, MAKER.make_query().data, 0x8201)  # another source gets its answer by itself
     [(can_id, data, _)] = frames.due
     assert can_id == 0x102 and parse_reply(data)[R.TEMPERATURE] == 26.0

@@ -44,12 +44,15 @@ LAWS = {
     "lq": 'kind="lq", speed_weight=100.0',
     "deadbeat": 'kind="deadbeat"',
     "speed": 'kind="speed"',
+    "position": 'kind="position"',
     "mtpa": 'kind="mtpa"',
 }
 
 
 def config_of(law: str) -> Path:
     """A configuration whose drive takes what the law asks for."""
+    if law == "position":  # it needs an angle
+        return CONFIGS / "position.toml"
     return DEMO if "voltage" in laws()[law].takes else CONFIGS / "current.toml"
 
 

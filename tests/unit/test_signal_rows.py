@@ -80,6 +80,7 @@ def test_the_terminal_has_every_field_with_a_line_and_a_new_one() -> None:
         ("speed", "w", "rad/s", 1.0), ("reference", "w_ref", "rad/s", 1.0),
         ("current q", "i_q", "A", 0.2), ("current d", "i_d", "A", 0.2),
         ("load estimate", "T_L_hat", "N m", 0.2), ("lateness", "lateness_ns", "us", 10.0),
+        ("angle error", "theta_error", "rad", 0.01),
     ]  # fmt: skip
     ticks = new_ticks(20)
     ticks["v_dc"], ticks["lateness_ns"] = np.arange(20), 3000
