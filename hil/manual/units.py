@@ -28,6 +28,7 @@ UNITS: Final = {
     "_ticks": "ticks",
     "_budget": "frames",
     "_every": "SYNCs",
+    "_turns": "turns",
     "bitrate": "bit/s",
     "_ohm": "ohm",
     "_deg": "deg",
