@@ -130,13 +130,6 @@ class SocketLink:
         """True when a frame of this kind can be sent."""
         return self._fd or not fd
 
-    def pending(self) -> bool:
-        """True when there is something to read, or an error to be seen by reading."""
-        try:
-            return bool(self._poll(0))
-        except ValueError:  # closed
-            return True
-
     def send_raw(self, raw: memoryview) -> None:
         """Send a frame that is laid out already; the caller answers for it."""
         try:

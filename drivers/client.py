@@ -2,7 +2,8 @@
 
 Fills a tick record in place, its fields found by name, so it needs no knowledge of who owns the record. What
 arrives damaged, repeated or of the wrong length is flagged and not applied; a bus that is down is flagged and
-nothing is sent until the client is closed.
+nothing is sent until the client is closed. What is received, sent and logged when, on any bus, are the
+kernels of :mod:`drivers.posix`; here is what they leave: what has to be judged, told or raised.
 """
 
 from __future__ import annotations
@@ -27,43 +28,43 @@ from drivers.errors import EncodeError, LinkDown, LinkError
 from drivers.frames import (
     BUS_DOWN,
     EMERGENCY,
-    ENABLE_OPERATION,
     ERROR_FRAME,
     FOREIGN_COMMAND,
     FRESH,
     LENGTH_ERROR,
     PLACES,
     SEND_FAILED,
-    SENT_FIELDS,
 )
 from drivers.jit import COMPILED, entry
 from drivers.local import ERR_FLAG
 from drivers.mapping import RECEIVED, DriveMap, house_map
 from drivers.oneshot import Expected, NoAnswer, Shot
-from drivers.port import Compiled, Saved, SocketPort
+from drivers.port import Arrays, Compiled, Port, Saved
 from drivers.posix import (
-    COMMANDED,
-    DRAIN_MOST,
-    EXCHANGED,
+    ASKS,
+    BEFORE,
     FLAGS,
-    LATE,
+    FLAGS_AT,
+    HANDED_BACK,
     PENDING,
+    RAISED,
     REFUSED_COMMAND,
     SEEN,
+    SILENT,
     SIZE,
-    SYNC_COUNTS,
+    STATE_AT,
     UNSENT,
+    begin,
     command,
     drain,
     exchange,
-    rest,
 )
 from drivers.rawlink import raw_link
 from drivers.record import bytes_of, cell_of
-from drivers.states import ENABLED, FAULT_RESET, codes_of, of_controlword, translator
+from drivers.states import codes_of, of_controlword
 from drivers.stops import STOP_PAUSE_S, Outgoing, try_all
 from drivers.tables import command_values, incoming_tables, outgoing_tables, sent_offsets
-from drivers.wire import DATA_AT, FD_BYTES, FRAME, ROOM, STATE, STATE_RAW, encode_command, note_sent, take
+from drivers.wire import DATA_AT, FRAME, ROOM, STATE, encode_command, note_sent
 
 BUS_OFF: Final = 0x40  # error classes of SocketCAN, linux/can/error.h
 RESTARTED: Final = 0x100
@@ -72,7 +73,7 @@ START: Final = 0x01
 PRE_OPERATIONAL: Final = 0x80
 """NMT commands of CiA 301."""
 DOWN: Final = "the bus was down; nothing more is sent"
-_GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _SYNCS, _PENDING, _DOWN = range(9)
+_GOT, _NEEDED, _ECHO_AT, _LOGGED, _LAST_SENT, _CONTROLWORD, _, _PENDING, _DOWN = range(9)
 _MISSING_AT: Final = (STATE.names or ()).index("missing_at")
 MAX_NS: Final = 2**63 - 1
 ASK_EVERY_NS: Final = 500_000_000
@@ -120,7 +121,6 @@ class DriveClient:
         self.binding: Binding = bind(drive_map or house_map(database), database, load=load)
         self._raw_link = raw_link(link, any(bound.message.fd for bound in self.binding.outgoing))
         self.seen: Counter[int] = Counter()
-        self._late = False
         self._tick: Any = None
         foreign = [bound.message for bound in self.binding.outgoing]
         self._foreign = {m.send_id for m in [*foreign, self.binding.sync] if m is not None}
@@ -139,14 +139,10 @@ class DriveClient:
         self._state = np.zeros(1, STATE)
         self._cells: Any = self._state.view("i8").data
         self._last = np.full(max(len(self.binding.incoming), 1), -1, np.int64)
-        link, real = self._raw_link, self._now is time.monotonic_ns
         shared = {"state": self._state, "words": self._words, "log": self._log}
-        if self._timed is not None:
+        if self._timed is not None and COMPILED:
             shared["ear"] = self._timed.words
-        self._port = SocketPort(link, shared) if COMPILED and real and isinstance(link, SocketLink) else None
-        self._drain_socket: Callable[[int, bool], int] | None = None
-        self._exchange: Callable[[int], int] | None = None
-        self._command: Callable[[], int] | None = None
+        self._port = Port(self._raw_link, shared, self._buffer_view, self._now)
 
     def _make_senders(self) -> None:
         """What lays out and sends each command and SYNC."""
@@ -155,35 +151,33 @@ class DriveClient:
         self._values: Any = values.data
         self._commanding = {"values": values, "messages": messages, "signals": signals}
         self._outgoing = [Outgoing(bound.message, i) for i, bound in enumerate(self.binding.outgoing)]
-        self._raws = np.concatenate([out.raw for out in self._outgoing])
-        for out, raw in zip(self._outgoing, np.split(self._raws, len(self._outgoing)), strict=True):
-            out.lay(raw)
-            args = (out.raw, values, out.index, messages, signals, self._state, self._words, self._log)
-            out.encode = partial(entry(encode_command, *args, 0), *args)
-            noting = (self._log, self._state, out.raw)
-            out.note = partial(entry(note_sent, *noting, 0), *noting)
-        on_change = self.binding.map.on_change
-        self._seldom = np.array([out.message.name in on_change for out in self._outgoing], np.uint8)
-        self._held = np.zeros_like(self._raws)
-        """What was sent last of each message."""
+        noting = self._log, self._state, self._outgoing[0].raw
+        self._note: Callable[..., int] = entry(note_sent, *noting, 0)
         self._stops = [self._stop_frames(out) for out in self._outgoing]
+        on_change = self.binding.map.on_change
+        self._commanding["seldom"] = np.array([out.message.name in on_change for out in self._outgoing], "u1")
+        self._commanding["raw"] = np.concatenate([out.raw for out in self._outgoing])
+        self._commanding["held"] = np.zeros_like(self._commanding["raw"])
         self._polls = self.binding.map.poll != ""
         self._sync = self._opening()
+        self._opens = {} if self._sync is None else {"sync": self._sync.raw}
+        self._sync_bytes = 0 if self._sync is None else len(self._sync.view)
+        self._begin = self._port.over(begin, self._opens, self._sync_bytes)
         self._started, self._left = (self._nmt_frame(command) for command in (START, PRE_OPERATIONAL))
 
     def _opening(self) -> Outgoing | None:
         """What begins the drive's cycle: SYNC, a request, or the command it answers, off until laid."""
-        opener, self._asks = self.binding.opener, self.request()
+        opener, asks = self.binding.opener, self.request()
         if opener is None:
             return None
         out = Outgoing(opener, 0)
         if self._polls:
             out.lay(np.tile(self._stops[-1][0].raw, 2))
-        elif self._asks is not None:
-            out.view[DATA_AT : DATA_AT + opener.length] = self._asks
+        elif asks is not None:
+            out.view[DATA_AT : DATA_AT + opener.length] = asks
+            self._port.io[ASKS] = 1
         else:
             out.raw[4] = min(opener.length, 1)
-        self._note_when_sent(out)
         return out
 
     def request(self) -> bytes | None:
@@ -195,15 +189,15 @@ class DriveClient:
 
     def _stop_frames(self, out: Outgoing) -> list[Outgoing]:
         """The stop frames of one message, ready to be sent, by the command's counter. Raises EncodeError."""
-        frames = []
-        noting = entry(note_sent, self._log, self._state, out.raw, 0)
+        values, messages, signals = (self._commanding[name] for name in ("values", "messages", "signals"))
+        args = out.raw, values, out.index, messages, signals, self._state, self._words, self._log
+        encode, frames = entry(encode_command, *args, 0), []
         for counter in range(self.binding.counter_modulus):
-            self._lay(counter, 0, 0.0, 0.0, 0.0)
-            if out.encode(0) < 0:
+            values[0] = counter
+            if encode(*args, 0) < 0:
                 self._refuse(out)
             frame = Outgoing(out.message, out.index)
             frame.raw[:] = out.raw
-            frame.encode = partial(noting, self._log, self._state, frame.raw)
             frames.append(frame)
         return frames
 
@@ -214,13 +208,7 @@ class DriveClient:
             return None
         frame = Outgoing(message, 0)
         frame.view[DATA_AT : DATA_AT + 2] = bytes((command, self.binding.node_id))
-        self._note_when_sent(frame)
         return frame
-
-    def _note_when_sent(self, frame: Outgoing) -> None:
-        """A frame that is laid out for good: all that is done when it is sent is to log it."""
-        noting = (self._log, self._state, frame.raw)
-        frame.encode = partial(entry(note_sent, *noting, 0), *noting)
 
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
@@ -229,32 +217,18 @@ class DriveClient:
         self._cells[_NEEDED] = needed
         self._cells[_ECHO_AT] = -1 if self.binding.map.echo else tick.dtype.fields["echo"][1]
         self._cells[_MISSING_AT] = _offset(tick, "missing") if "missing" in tick.dtype.fields else 0
-        args = (self._buffer, messages, signals, self._last, self._state, self._words, raw, self._log)
-        self._take: Callable[[int, bool, int], int] = partial(entry(take, *args, 0, False, 0), *args)
-        self._translate = translator(self.binding.map.states, lambda: int(self._cells[_CONTROLWORD]))
-        self._flags_cell, self._state_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_state")
-        self._error_cell = cell_of(tick, "drive_error")
+        self._flags_cell, self._error_cell = cell_of(tick, "rx_flags"), cell_of(tick, "drive_error")
         self._note_absent(tick)
-        self._note_state(0)
-        self._sent_cells = [cell_of(tick, name) for name in SENT_FIELDS]
         if self._timed is not None and isinstance(self._raw_link, SocketLink):
             all_but(self._raw_link.receiving, self._timed.send_id)  # not before: others were listened for
-        if self._port is not None:
-            incoming = {"raw": self._buffer, "messages": messages, "signals": signals, "last": self._last}
-            own = {"tick": raw, **incoming, "codes": codes_of(self.binding.map.states)}
-            self._drain_socket = self._port.drainer(
-                own, _offset(tick, "rx_flags"), _offset(tick, "drive_state")
-            )
-            if self._sync is not None and self._asks is None:
-                size = len(self._sync.view)
-                self._exchange = self._port.exchanger(own | {"sync": self._sync.raw}, size)
-            if len(self._outgoing) == 1 or not self._polls:
-                own = {"tick": raw, "raw": self._raws, "fields": sent_offsets(tick.dtype)}
-                own |= {"sync": self._sync.raw} if self._sync is not None and self._polls else {}
-                own |= {"seldom": self._seldom, "held": self._held}
-                self._command = self._port.commander(own | self._commanding)
-        if self._sync is not None:
-            rest(self._sync.raw)
+        port = self._port
+        port.io[FLAGS_AT], port.io[STATE_AT] = _offset(tick, "rx_flags"), _offset(tick, "drive_state")
+        own: Arrays = {"tick": raw, "messages": messages, "signals": signals}
+        own |= {"raw": self._buffer, "last": self._last, "codes": codes_of(self.binding.map.states)}
+        self._drain = port.over(drain, own, free=(0, False))
+        self._exchange = port.over(exchange, own | self._opens, self._sync_bytes, free=(0,))
+        own = {"tick": raw, "fields": sent_offsets(tick.dtype)} | self._commanding
+        self._command = port.over(command, own | (self._opens if self._polls else {}))
         self._tick = tick
 
     def _note_absent(self, tick: Any) -> None:
@@ -263,13 +237,16 @@ class DriveClient:
         for field in ("i_q", "i_d"):
             if field not in reported:
                 tick[field] = float("nan")
+        if self.binding.map.state == "":
+            self._port.io[SILENT] = 1
+            tick["drive_state"] = of_controlword(0)
 
     def compiled(self) -> Compiled | None:
-        """For the record that it is prepared for; None where receiving and command are not compiled."""
-        if self._port is None or self._command is None or self.binding.map.state == "":
+        """For the record that it is prepared for; None with the compiler off."""
+        if not COMPILED:
             return None
-        places, size = self._port.places, 0 if self._sync is None else len(self._sync.view)
-        return Compiled(places.get(exchange), places[drain], places[command], size, self._log)
+        places = self._port.places
+        return Compiled(places[exchange], places[drain], places[command], self._sync_bytes, self._log)
 
     @property
     def timed(self) -> KernelSync | None:
@@ -283,60 +260,25 @@ class DriveClient:
 
     def sync(self, tick: Any) -> None:
         """Send SYNC with its counter 1..240, after what came since the last tick was taken as late."""
-        if code := self._begun(EXCHANGED):
-            self._conclude(code, 0)
-        self._cells[_GOT] = 0
-        self._take_late(tick)
+        self.follow(tick)
         self._send_sync()
 
     def follow(self, tick: Any) -> None:
         """:meth:`sync` of a client beside another one, which sends SYNC for both."""
-        self._cells[_GOT] = 0
-        self._take_late(tick)
+        if tick is not self._tick:
+            self.prepare(tick)
+        self._follow(self._port.left())
 
     def exchange(self, tick: Any, deadline_ns: int) -> None:
         """:meth:`sync` and :meth:`receive`, in one compiled call where nothing is late. Raises as they do."""
-        code = PENDING
-        if self._exchange is not None and tick is self._tick:
-            code = self._begun(EXCHANGED) or self._exchange(deadline_ns)
-        if code == PENDING:
-            self.sync(tick)
-            self.receive(tick, deadline_ns)
-        elif code:
-            self._conclude(code, deadline_ns)
-
-    def _begun(self, what: int) -> int:
-        """What a compiled tick has begun and left to be concluded here, 0 for nothing."""
-        return 0 if self._port is None else self._port.begun(what)
-
-    def _conclude(self, code: int, deadline_ns: int) -> None:
-        """What :func:`drivers.posix.exchange` could not do itself. Raises LinkError when SYNC is not out."""
-        if code <= UNSENT:
-            self._fail(code - UNSENT)
-        self._judge(code, deadline_ns)
-
-    def _take_late(self, tick: Any) -> None:
-        self._late = True
-        try:
-            if code := self._begun(LATE):
-                self._judge(code, 0)
-            else:
-                self.receive(tick, 0)
-        finally:
-            self._late = False
-            self._cells[_GOT] = 0
-
-    def _send_sync(self) -> None:
-        if self._sync is None:
-            return
-        self._cells[_SYNCS] = count = self._cells[_SYNCS] % SYNC_COUNTS + 1
-        if self._asks is None and self._sync.raw[4] == 1:
-            self._sync.view[DATA_AT] = count
-        self._sync.encode(self._now())
-        try:
-            self._transmit(self._sync)
-        finally:
-            rest(self._sync.raw)
+        if tick is not self._tick:
+            self.prepare(tick)
+        code = self._port.left() or self._exchange(deadline_ns)
+        if code == PENDING or code <= BEFORE + HANDED_BACK:
+            self._follow(0 if code == PENDING else code)
+            self._send_sync()
+            code = self._drain(deadline_ns, False)
+        self._conclude(code, deadline_ns)
 
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Drain the bus until feedback came or the deadline passed; 0 drains what is there (newest wins).
@@ -345,72 +287,60 @@ class DriveClient:
         """
         if tick is not self._tick:
             self.prepare(tick)
-        if code := self._begun(EXCHANGED):
-            self._conclude(code, deadline_ns)
-            return
-        drain = self._drain_socket
-        code = 0 if drain is None else drain(deadline_ns, self._late)
-        if code or drain is None or self._cells[_PENDING] or self._cells[_DOWN]:
-            self._judge(code, deadline_ns)
+        if (code := self._port.left()) <= BEFORE + HANDED_BACK:
+            self._follow(code)
+            code = 0
+        self._conclude(code or self._drain(deadline_ns, False), deadline_ns)
 
-    def _judge(self, code: int, deadline_ns: int) -> None:
-        """Take what the kernel handed back, or all where there is none; the flags of it go into the tick."""
-        drain = self._drain_socket
+    def _follow(self, code: int) -> None:
+        """Take what came before SYNC as late; ``code``: what a compiled tick has left of that."""
+        self._cells[_GOT] = 0
+        if code <= BEFORE + HANDED_BACK:
+            code -= BEFORE
+        self._conclude(code or self._drain(0, True), 0, late=True)
+        self._cells[_GOT] = 0
+
+    def _send_sync(self) -> None:
+        if self._cells[_DOWN]:
+            raise LinkDown(100, DOWN)
+        if code := self._begin():
+            self._fail(code - UNSENT)
+
+    def _conclude(self, code: int, deadline_ns: int, late: bool = False) -> None:
+        """Do what a kernel could not; the flags of it go into the tick. Raises LinkError without SYNC."""
+        if not (code or self._cells[_PENDING] or self._cells[_DOWN]):
+            return
+        if code <= UNSENT:
+            self._fail(code - UNSENT)
         flags, self._cells[_PENDING] = self._cells[_PENDING], 0
         try:
-            flags |= self._drain(deadline_ns) if drain is None else self._go_on(code, drain, deadline_ns)
+            self._go_on(code, deadline_ns, late)
         except LinkDown:
             self._go_down()
         except LinkError:
             flags |= ERROR_FRAME
         self._flags_cell[0] |= flags | (BUS_DOWN if self._cells[_DOWN] else 0)
 
-    def _drain(self, deadline_ns: int) -> int:
-        """Flags of all that came."""
-        receive, buffer, cells = self._raw_link.receive_into, self._buffer_view, self._cells
-        flags, left, more = 0, 0, DRAIN_MOST
-        while more:
-            if deadline_ns and (left := deadline_ns - time.monotonic_ns()) < 0:
-                left = 0
-            more -= left == 0
-            size = receive(buffer, left)
-            if not size:
-                break
-            seen = self._take(size, self._late, self._now())
-            flags |= seen if 0 <= seen < STATE_RAW else self._finish(seen, size)
-            if cells[_LOGGED] >= ROOM - 1:
-                self.flush()
-            if flags & FRESH and deadline_ns:
-                break
-        return flags
-
-    def _go_on(self, code: int, drain: Callable[[int, bool], int], deadline_ns: int) -> int:
-        """:meth:`_drain` from where the compiled kernel has handed back what it can't judge."""
-        port = self._port
-        assert port is not None  # noqa: S101 - made together with the kernel
-        io = port.io
+    def _go_on(self, code: int, deadline_ns: int, late: bool) -> None:
+        """Judge the frame that :func:`drivers.posix.drain` has handed back, and so on until it is done."""
+        io = self._port.io
         while code:
             if code < 0:
-                port.restart()
-                raise_link_error(OSError(-code, os.strerror(-code)), "receive")
-            io[FLAGS] |= io[SEEN] if 0 <= io[SEEN] < STATE_RAW else self._finish(io[SEEN], io[SIZE])
+                self._port.restart()
+                self._raise(code, "receive")
+            io[FLAGS] |= self._judge(io[SIZE]) if io[SEEN] < 0 else io[SEEN]
             if self._cells[_LOGGED] >= ROOM - 1:
                 self.flush()
             if deadline_ns and io[FLAGS] & FRESH:
-                flags = int(io[FLAGS])
-                port.restart()
-                return flags
-            code = drain(deadline_ns, self._late)
-        return 0
+                self._flags_cell[0] |= io[FLAGS]
+                self._port.restart()
+                return
+            code = self._drain(deadline_ns, late)
 
-    def _finish(self, seen: int, size: int) -> int:
-        """Flags of a frame that the kernel leaves to be finished: one of no measurement, or a raw state."""
-        if seen < 0:
-            frame = unpack_frame(bytes(self._buffer_view[:size]))
-            return 0 if frame is None else self._other(frame)
-        assert self._translate is not None  # noqa: S101 - without a translation no state is raw
-        self._state_cell[0] = self._translate(self._state_cell[0])
-        return seen ^ STATE_RAW
+    def _judge(self, size: int) -> int:
+        """Flags of a frame that the kernel can't judge."""
+        frame = unpack_frame(bytes(self._buffer_view[:size]))
+        return 0 if frame is None else self._other(frame)
 
     def _other(self, frame: Frame) -> int:
         """Flags of a frame that measures nothing. Remote frames match no identifier."""
@@ -441,63 +371,29 @@ class DriveClient:
         """Send the tick's command. Raises EncodeError or LinkError; a queue that is full is flagged."""
         if tick is not self._tick:
             self.prepare(tick)
-        if self._command is not None and not self._cells[_DOWN]:
-            code = self._begun(COMMANDED) or self._command()
-            if code:
-                if code <= REFUSED_COMMAND:
-                    self._refuse(self._outgoing[REFUSED_COMMAND - code])
-                self._fail(code)
-        else:
-            counter, controlword, u_q, u_d, T_L = self._sent_cells
-            self._send_command(counter[0], controlword[0], u_q[0], u_d[0], T_L[0])
-            self._note_state(controlword[0])
+        code = self._port.left()
+        if self._cells[_DOWN]:
+            raise LinkDown(100, DOWN)
+        if code := code or self._command():
+            if code <= REFUSED_COMMAND:
+                self._refuse(self._outgoing[REFUSED_COMMAND - code])
+            self._fail(code)
         if self._cells[_LOGGED] >= FLUSH_AT:
             self.flush()
 
     def _fail(self, code: int) -> NoReturn:
         """Raise what -errno of sending means, and remember it."""
         try:
-            raise_link_error(OSError(-code, os.strerror(-code)), "send")
+            self._raise(code, "send")
         except LinkError as error:
             self._note_failure(error)
             raise
 
-    def _send_command(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
-        """Lay out all frames before the first is sent, then send them, the one with u_q last."""
-        self._lay(counter, controlword, u_q, u_d, T_L)
-        now_ns = self._now()
-        for out in self._outgoing:
-            if out.encode(now_ns) < 0:
-                self._refuse(out)
-        for out in self._outgoing:
-            if self._polls and self._sync is not None:
-                self._sync.raw[: len(out.raw)] = out.raw
-            elif not (self._seldom[out.index] and (out.raw == self._last_sent(out)).all()):
-                self._send_noted(out, now_ns)
-                self._last_sent(out)[:] = out.raw
-        self._cells[_LAST_SENT], self._cells[_CONTROLWORD] = counter, controlword
-
-    def _last_sent(self, out: Outgoing) -> Any:
-        """The frame of a message that was sent last."""
-        return self._held[FD_BYTES * out.index : FD_BYTES * (out.index + 1)]
-
-    def _send_noted(self, out: Outgoing, now_ns: int) -> None:
-        """Send a command; of several the last that was laid out stands in the log's next place."""
-        if len(self._outgoing) > 1:
-            out.note(now_ns)
-        self._transmit(out)
-
-    def _note_state(self, controlword: int) -> None:
-        """A drive that does not say its state is taken to be where the command leads."""
-        if self.binding.map.state == "":
-            on = controlword == ENABLE_OPERATION
-            self._state_cell[0] = ENABLED if on else of_controlword(controlword)
-
-    def _lay(self, counter: int, controlword: int, u_q: float, u_d: float, T_L: float) -> None:
-        """Set what the encoder lays out."""
-        values = self._values
-        values[0], values[1], values[2], values[3], values[4] = counter, controlword, u_q, u_d, T_L
-        values[5], values[6] = controlword == ENABLE_OPERATION, controlword & FAULT_RESET != 0
+    def _raise(self, code: int, action: str) -> NoReturn:
+        """Raise what -errno means, or what a bus that is no descriptor has raised."""
+        if code == RAISED and self._port.raised is not None:
+            raise self._port.raised
+        raise_link_error(OSError(-code, os.strerror(-code)), action)
 
     def _refuse(self, out: Outgoing) -> NoReturn:
         """Raise with the codec's words what of a command can't be sent."""
@@ -556,7 +452,6 @@ class DriveClient:
         """Send a frame that is sent once."""
         frame = Outgoing(shot.message, 0)
         frame.view[DATA_AT : DATA_AT + len(shot.data)] = shot.data
-        self._note_when_sent(frame)
         self._stop_with(frame)
 
     def _await(self, shot: Shot) -> None:
@@ -612,7 +507,7 @@ class DriveClient:
 
     def _stop_with(self, frame: Outgoing) -> None:
         with contextlib.suppress(Exception):  # a log that can't note it does not hold it back
-            frame.encode(self._now())
+            self._note(self._log, self._state, frame.raw, self._now())
         self._transmit(frame)
 
     def _note_length(self, frame: Frame) -> None:

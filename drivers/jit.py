@@ -7,13 +7,13 @@ module; it knows neither.
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar, cast
+from typing import Any, Final, TypeVar, cast
 
 import numba
 import numpy as np
-import numpy.typing as npt
-from llvmlite import binding
+from llvmlite import binding, ir
 from numba import types
 from numba.core import cgutils
 from numba.core import config as numba_config
@@ -82,8 +82,13 @@ def place_of(array: Any, dtype: Any) -> tuple[int, int]:
     return array.__array_interface__["data"][0], len(array)
 
 
-def places_of(arrays: Mapping[str, Any], kinds: Mapping[str, Any]) -> npt.NDArray[np.int64]:
-    """:func:`place_of` for each of ``kinds`` in their order, 0 where there is no array of the name."""
+def places_of(arrays: Mapping[str, Any], kinds: Mapping[str, Any]) -> Any:
+    """:func:`place_of` for each of ``kinds`` in their order, 0 where there is no array of the name.
+
+    With the compiler off the arrays themselves, one of none where there is no array.
+    """
+    if not COMPILED:
+        return [arrays.get(name, np.zeros(0, dtype)) for name, dtype in kinds.items()]
     places = np.zeros((len(kinds), 2), np.int64)
     for index, (name, dtype) in enumerate(kinds.items()):
         if (array := arrays.get(name)) is not None:
@@ -108,7 +113,7 @@ def array_at(places: Any, index: int, dtype: Any) -> Any:
     """The array at a place: row ``index`` of what :func:`places_of` returned.
 
     To unpack an array of numpy's costs a kernel of a few microseconds most of its time, above all from a cold
-    cache; it unpacks one of places instead. Compiled code only: the interpreter can't follow an address.
+    cache; it unpacks one of places instead.
     """
     return carray(_behind(places[index, 0]), (places[index, 1],), dtype)
 
@@ -117,3 +122,40 @@ def array_at(places: Any, index: int, dtype: Any) -> Any:
 def places_at(places: Any, index: int) -> Any:
     """The table of places at a place: of its plain row, as :func:`place_of` takes it."""
     return carray(_behind(places[index, 0]), (places[index, 1] // 2, 2), np.int64)
+
+
+CALL: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+"""A function of Python's that kernels call: two whole numbers to one."""
+
+
+def _to_call(_typing: Any, address: Any, first: Any, second: Any) -> Any:
+    """What the function at an address returns."""
+
+    def made(_context: Any, builder: Any, _signature: Any, args: Any) -> Any:
+        word = ir.IntType(64)
+        function = builder.inttoptr(args[0], ir.FunctionType(word, [word, word]).as_pointer())
+        return builder.call(function, args[1:])
+
+    word = numba_types.int64
+    return word(word, word, word), made
+
+
+_calling: Any = intrinsic(_to_call)
+
+
+@jit
+def call(address: int, first: int, second: int) -> Any:
+    """Call the :data:`CALL` at an address."""
+    return _calling(address, first, second)
+
+
+def _interpreted_array_at(places: Any, index: int, dtype: Any) -> Any:
+    return places[index]
+
+
+def _interpreted_call(address: int, first: int, second: int) -> Any:
+    return CALL(int(address))(int(first), int(second))
+
+
+if not COMPILED:  # the interpreter follows no address
+    array_at, call = _interpreted_array_at, _interpreted_call

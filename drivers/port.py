@@ -1,31 +1,38 @@
-"""The client's way to a socket by the kernels of :mod:`drivers.posix`: two calls a tick."""
+"""The client's way to its bus by the kernels of :mod:`drivers.posix`: two calls a tick."""
 
 from __future__ import annotations
 
+import ctypes
+import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from drivers.bus import SocketLink
-from drivers.jit import entry, places_of
+from drivers.jit import CALL, COMPILED, entry, places_of
 from drivers.posix import (
     ARRAYS,
+    DONE,
     DRAIN_MOST,
     FLAGS,
-    FLAGS_AT,
+    IO_WORDS,
+    LEFT,
     MORE,
-    STATE_AT,
-    command,
-    drain,
-    exchange,
+    OVER,
+    RAISED,
+    RECEIVES,
+    SENDS,
+    TELLS,
 )
-from drivers.wire import STATE
+from drivers.rawlink import RawLink
 
 Arrays = dict[str, Any]
 """What :data:`drivers.posix.ARRAYS` names."""
+NOWHERE: Final = np.full(4, -1, np.int32)
+"""Descriptors of no file."""
 
 
 class Saved(NamedTuple):
@@ -38,61 +45,83 @@ class Saved(NamedTuple):
 class Compiled(NamedTuple):
     """What a compiled tick calls the kernels of :mod:`drivers.posix` with.
 
-    ``exchange``, ``receive`` and ``command`` are places, ``exchange`` None for a drive without SYNC;
-    ``sync_bytes``: size of SYNC's frame, ``log``: the frames.
+    ``exchange``, ``receive`` and ``command`` are places; ``sync_bytes``: size of SYNC's frame, ``log``: the
+    frames.
     """
 
-    exchange: npt.NDArray[np.int64] | None
+    exchange: npt.NDArray[np.int64]
     receive: npt.NDArray[np.int64]
     command: npt.NDArray[np.int64]
     sync_bytes: int
     log: npt.NDArray[np.void]
 
 
-class SocketPort:
-    """The kernels of one socket. ``shared``: the client's arrays that all of them use, by name."""
+class Port:
+    """The kernels of one link. ``shared``: the client's arrays that all of them use, by name.
 
-    def __init__(self, link: SocketLink, shared: Arrays) -> None:
-        io = np.zeros(STATE_AT + 1, np.int64)
+    ``buffer``: where what is received goes; ``now``: what frames are stamped with.
+    """
+
+    def __init__(self, link: RawLink, shared: Arrays, buffer: memoryview, now: Callable[[], int]) -> None:
+        io = np.zeros(IO_WORDS, np.int64)
         self.io: Any = io.data
-        self.places: dict[Any, npt.NDArray[np.int64]] = {}
+        self.places: dict[Any, Any] = {}
         """What each kernel is called with."""
-        self._shared: Arrays = {"fds": link.fds, "times": np.zeros(4, np.int64), "io": io, **shared}
-        self._alive: dict[Any, Arrays] = {}
-
-    def _over(self, kernel: Any, own: Arrays, *known: Any, free: tuple[Any, ...]) -> Callable[..., int]:
-        """The compiled form; the call that makes it, with ``free``, leads nowhere and leaves no trace."""
-        arrays = self._shared | own
-        self._alive[kernel] = arrays
-        io, state = np.zeros_like(self.io), np.zeros(1, STATE)
-        nowhere = {"fds": np.full(4, -1, np.int32), "io": io, "state": state}
-        compiled = entry(kernel, places_of(arrays | nowhere, ARRAYS), *known, *free)
-        self.places[kernel] = places_of(arrays, ARRAYS)
-        return partial(compiled, self.places[kernel], *known)
-
-    def drainer(self, own: Arrays, flags_at: int, state_at: int) -> Callable[[int, bool], int]:
-        """:func:`drivers.posix.drain` over what :func:`drivers.wire.take` takes; offsets in the tick."""
-        self.io[FLAGS], self.io[MORE], self.io[FLAGS_AT], self.io[STATE_AT] = 0, 0, flags_at, state_at
-        made = self._over(drain, own, free=(0, False))
+        self.raised: BaseException | None = None
+        """What a function of Python's has raised that a kernel has called."""
+        self._alive: list[Any] = []
+        fds = NOWHERE
+        if COMPILED and isinstance(link, SocketLink):
+            fds = link.fds
+        else:
+            io[RECEIVES] = self._called(lambda left_ns, _: link.receive_into(buffer, left_ns) or OVER)
+            io[SENDS] = self._called(partial(_send, link))
+        if not (COMPILED and now is time.monotonic_ns):
+            io[TELLS] = self._called(lambda *_: now())
+        self._shared: Arrays = {"fds": fds, "times": np.zeros(4, np.int64), "io": io, **shared}
         self.restart()
-        return made
+
+    def _called(self, act: Callable[[int, int], int]) -> int:
+        """The address of a function that kernels call; it never raises."""
+
+        def safe(first: int, second: int) -> int:
+            try:
+                return act(first, second)
+            except BaseException as error:  # noqa: BLE001 - no exception passes through C: the client raises it
+                self.raised = error
+                return RAISED
+
+        made = CALL(safe)
+        self._alive.append(made)
+        return ctypes.cast(made, ctypes.c_void_p).value or 0
+
+    def over(self, kernel: Any, own: Arrays, *known: Any, free: tuple[Any, ...] = ()) -> Callable[..., int]:
+        """The kernel over the client's arrays; it is called with what comes after ``known``.
+
+        The call that makes the compiled form, with ``free``, leads nowhere and leaves no trace.
+        """
+        arrays = self._shared | own
+        self.places[kernel] = places_of(arrays, ARRAYS)
+        self._alive.append(arrays)
+        compiled = kernel
+        if COMPILED:
+            copies = {name: array.copy() for name, array in arrays.items()}
+            copies |= {"fds": NOWHERE, "io": np.zeros_like(arrays["io"])}
+            compiled = entry(kernel, places_of(copies, ARRAYS), *known, *free)
+        return partial(compiled, self.places[kernel], *known)
 
     def restart(self) -> None:
         """Let the next drain begin anew."""
         self.io[FLAGS], self.io[MORE] = 0, DRAIN_MOST
 
-    def begun(self, what: int) -> int:
-        """What an EXCHANGED, COMMANDED or LATE that a kernel has begun came to; 0 for none."""
-        code: int = self.io[what]
-        self.io[what] = 0
+    def left(self) -> int:
+        """What a kernel returned that a compiled tick has left to the client; 0 for nothing."""
+        code: int = self.io[LEFT]
+        self.io[LEFT] = 0
         return code
 
-    def exchanger(self, own: Arrays, size: int) -> Callable[[int], int]:
-        """:func:`drivers.posix.exchange` for a SYNC that is laid out; called with the deadline."""
-        made = self._over(exchange, own, size, free=(0,))
-        self.restart()
-        return made
 
-    def commander(self, own: Arrays) -> Callable[[], int]:
-        """:func:`drivers.posix.command` for the messages of a command."""
-        return self._over(command, own, free=())
+def _send(link: RawLink, address: int, size: int) -> int:
+    """The frame at an address."""
+    link.send_raw(memoryview(ctypes.string_at(address, size)))
+    return DONE

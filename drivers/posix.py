@@ -1,8 +1,10 @@
-"""The exchange with a socket as compiled kernels that call the C library: no interpreter between the frames.
+"""The exchange with a bus as compiled kernels that call the C library: no interpreter between the frames.
 
 :func:`drain` is the wait for a tick's feedback: ppoll to an absolute deadline with nanoseconds, one read a
 frame, each handed to :func:`drivers.wire.take`. What it can't judge itself it hands back to the caller, who
 calls again to go on. The symbols are the process's own (POSIX), so that the compiled form can be cached.
+A bus that is no descriptor, and a clock that is not the system's, are functions of Python's that are called
+in the C library's place; all else is the same. So it is with the compiler off.
 
 To unpack an array of numpy's at every call costs more than what most kernels here do with it. Those that a
 tick calls take one array instead: the places (address and length) of all the others, as
@@ -11,6 +13,7 @@ tick calls take one array instead: the places (address and length) of all the ot
 
 from __future__ import annotations
 
+import time
 from typing import Any, Final
 
 import numba
@@ -18,8 +21,8 @@ import numpy as np
 from numba import types
 
 from drivers.frames import ENABLE_OPERATION, FOREIGN_COMMAND, FRESH
-from drivers.jit import array_at, jit, waiting
-from drivers.states import FAULT_RESET, state_of
+from drivers.jit import COMPILED, array_at, call, jit, waiting
+from drivers.states import ENABLED, FAULT_RESET, of_controlword, state_of
 from drivers.wire import (
     CLASSIC_BYTES,
     DATA_AT,
@@ -58,9 +61,18 @@ REFUSED_COMMAND: Final = -1000
 """A value of the command fits no signal: this and less by the message's place; others are -errno."""
 UNSENT: Final = -2000
 """What -errno of a SYNC that was not sent is added to."""
+BEFORE: Final = -4000
+"""What is added to what :func:`drain` returns of the frames that came before SYNC."""
+RAISED: Final = -999
+"""In place of -errno: the function of Python's has raised something."""
+OVER: Final = -998
+"""In place of -errno: a bus that is no descriptor has nothing more, whatever time is left."""
 RECEIVING, SENDING, POLL_FD, POLL_EVENTS = range(4)
-FLAGS, SEEN, SIZE, MORE, FLAGS_AT, EXCHANGED, COMMANDED, LATE, STATE_AT = range(9)
-"""Of ``io``. STATE_AT: offset of the tick's drive_state."""
+FLAGS, SEEN, SIZE, MORE, FLAGS_AT, STATE_AT, LEFT, ASKS, SILENT, RECEIVES, SENDS, TELLS, IO_WORDS = range(13)
+"""Of ``io``. LEFT: what a kernel returned that a compiled tick has left to the client, 0 for nothing.
+FLAGS_AT, STATE_AT: offsets of the tick's rx_flags and drive_state. ASKS: SYNC is a request, which has no
+counter; SILENT: the drive does not say its state. RECEIVES, SENDS, TELLS: functions to call, 0 for the
+descriptors and CLOCK_MONOTONIC."""
 EAR_FD, PERIOD, SYNCED, STAMP, MESSAGE_AT = range(5)
 IOV_AT, CONTROL_AT, FRAME_AT, EAR_WORDS = 11, 13, 21, 30
 """Words of an ear: its descriptor, the period, how many SYNCs were heard since the last look, when the newest
@@ -106,6 +118,20 @@ def now_ns(times: Any) -> Any:
     return clock_ns(MONOTONIC, times)
 
 
+def _interpreted_now_ns(times: Any) -> Any:
+    return time.monotonic_ns()
+
+
+if not COMPILED:
+    now_ns = _interpreted_now_ns
+
+
+@jit
+def stamp_ns(io: Any, times: Any) -> Any:
+    """The time by the client's clock, for the log [ns]."""
+    return now_ns(times) if io[TELLS] == 0 else call(io[TELLS], 0, 0)
+
+
 @jit
 def wait(fds: Any, times: Any, left_ns: int) -> Any:
     """Wait until there is something to read: 1, 0 when the time has passed, or -errno."""
@@ -120,6 +146,18 @@ def receive(fds: Any, raw: Any) -> Any:
     """Read what is there into ``raw``: its size, or -errno, -EAGAIN when there is nothing."""
     size = _recv(fds[RECEIVING], raw.ctypes.data, len(raw), DONTWAIT)
     return -errno() if size < 0 else size
+
+
+@jit
+def next_frame(io: Any, fds: Any, times: Any, raw: Any, left_ns: int) -> Any:
+    """The next frame, waited for: its size in ``raw``; -errno, -EAGAIN when there is none, or OVER."""
+    if io[RECEIVES] != 0:
+        return call(io[RECEIVES], left_ns, 0)
+    if left_ns > 0:
+        ready = wait(fds, times, left_ns)
+        if ready <= 0:
+            return -EAGAIN if ready == 0 else ready
+    return receive(fds, raw)
 
 
 @waiting
@@ -137,31 +175,25 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
     ear = array_at(places, EAR, I8)
     while io[MORE] > 0:
         left_ns = max(deadline_ns - now_ns(times), 0) if deadline_ns > 0 else 0
-        if left_ns > 0:
-            ready = wait(fds, times, left_ns)
-            if ready == 0:
-                continue
-            if ready < 0 and ready != -EINTR:
-                return ready
-        else:
+        if left_ns == 0:
             io[MORE] -= 1
-        size = receive(fds, raw)
+        size = next_frame(io, fds, times, raw, left_ns)
         if size < 0:
             if size == -EINTR or (size == -EAGAIN and left_ns > 0):
                 continue
-            if size != -EAGAIN:
+            if size not in (-EAGAIN, OVER):
                 return size
             break
         if len(ear) > 0:
             hear(ear, io, state, log, times)
             late = ear[SYNCED] == 0
-        seen = take(raw, messages, signals, last, state, words, tick, log, size, late, now_ns(times))
-        if seen >= STATE_RAW and io[STATE_AT] > 0:
+        seen = take(raw, messages, signals, last, state, words, tick, log, size, late, stamp_ns(io, times))
+        if seen >= STATE_RAW:
             cell = tick[io[STATE_AT] : io[STATE_AT] + 4].view(np.uint32)
             raw_state: Any = np.int64(cell[0])
             cell[0] = state_of(array_at(places, CODES, I8), raw_state, state[0]["controlword"])
             seen ^= STATE_RAW
-        if seen < 0 or seen >= STATE_RAW or state[0]["logged"] >= len(log) - 1 > 0:
+        if seen < 0 or state[0]["logged"] >= len(log) - 1 > 0:
             io[SEEN], io[SIZE] = seen, size
             return HANDED_BACK
         io[FLAGS] |= seen
@@ -214,15 +246,22 @@ def finish(io: Any, tick: Any) -> None:
 
 
 @jit
-def transmit(fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
-    """Send a frame that is laid out; it then counts in the log. Returns DONE or -errno."""
+def write(fds: Any, raw: Any, size: int) -> Any:
+    """Send a frame that is laid out. Returns DONE or -errno."""
     while _send(fds[SENDING], raw.ctypes.data, size, 0) < 0:
         code = errno()
         if code != EINTR:
             return -code
-    if state[0]["logged"] < len(log):
-        state[0]["logged"] += 1
     return DONE
+
+
+@jit
+def transmit(io: Any, fds: Any, raw: Any, size: int, state: Any, log: Any) -> Any:
+    """:func:`write`, on whatever bus; the frame then counts in the log."""
+    code = write(fds, raw, size) if io[SENDS] == 0 else call(io[SENDS], raw.ctypes.data, size)
+    if code == DONE and state[0]["logged"] < len(log):
+        state[0]["logged"] += 1
+    return code
 
 
 @jit
@@ -241,31 +280,53 @@ def exchange(places: Any, size: int, deadline_ns: int) -> Any:
 
 @jit
 def opened(places: Any, size: int) -> Any:
-    """Take what waits as late and send SYNC with its counter; PENDING where SYNC must wait.
+    """:func:`before`, then :func:`begin`. PENDING, and nothing is done, where SYNC must wait.
 
-    A command that the drive answers stands in SYNC's place, the frame that says off behind it.
-
-    It waits for flags to be told, a bus that was down, and what can't be judged of the late frames, which is
-    in ``IO`` at LATE then. Returns DONE, or UNSENT - errno when SYNC was not sent.
+    It waits for flags to be told, and a bus that was down.
     """
-    fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
-    state, log = array_at(places, STATES, STATE), array_at(places, LOG, FRAME)
-    s, io = state[0], array_at(places, IO, I8)
-    if s["pending"] != 0 or s["down"] != 0 or io[LATE] != 0:
+    s = array_at(places, STATES, STATE)[0]
+    if s["pending"] != 0 or s["down"] != 0:
         return PENDING
+    code = before(places)
+    return begin(places, size) if code == DONE else code
+
+
+@jit
+def before(places: Any) -> Any:
+    """Take what waits as late. Returns DONE, or BEFORE and what can't be judged of it."""
+    s = array_at(places, STATES, STATE)[0]
     s["got"] = 0
     code = drain(places, 0, True)
-    if code != DONE:
-        io[LATE] = code
-        return PENDING
     s["got"] = 0
+    return DONE if code == DONE else BEFORE + code
+
+
+@jit
+def begin(places: Any, size: int) -> Any:
+    """Send SYNC with its counter, or what stands in its place. Returns DONE or UNSENT - errno.
+
+    A command that the drive answers stands there, the frame that says off behind it.
+    """
+    fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, SYNC, U1)
+    state, log, io = array_at(places, STATES, STATE), array_at(places, LOG, FRAME), array_at(places, IO, I8)
+    s = state[0]
+    if len(raw) == 0:
+        return DONE
     s["syncs"] = s["syncs"] % SYNC_COUNTS + 1
-    if raw[4] == 1:
+    if raw[4] == 1 and io[ASKS] == 0:
         raw[DATA_AT] = s["syncs"]
-    note(log, s, raw, 0, now_ns(times))
-    code = transmit(fds, raw, size, state, log)
+    note(log, s, raw, 0, stamp_ns(io, times))
+    code = transmit(io, fds, raw, size, state, log)
     rest(raw)
     return DONE if code == DONE else UNSENT + code
+
+
+@jit
+def left(places: Any, code: int) -> Any:
+    """Whether a compiled tick has something left to the client, which then goes on from this code."""
+    if code not in (DONE, PENDING):
+        array_at(places, IO, I8)[LEFT] = code
+    return code != DONE
 
 
 @jit
@@ -286,16 +347,16 @@ def gather(values: Any, tick: Any, fields: Any) -> None:
 def command(places: Any) -> Any:
     """Lay out all messages of a tick's command, then send them. Returns DONE, REFUSED_COMMAND... or -errno.
 
-    One that the drive answers is laid in SYNC's place, from where :func:`exchange` sends it. A ``SELDOM`` one
+    One that the drive answers is laid in SYNC's place, from where :func:`begin` sends it. A ``SELDOM`` one
     is sent when it is another than the one sent last, which is ``HELD``.
     """
     fds, times, raw = array_at(places, FDS, I4), array_at(places, TIMES, I8), array_at(places, RAW, U1)
     values, fields = array_at(places, VALUES, F8), array_at(places, FIELDS, I8)
     messages, signals = array_at(places, MESSAGES, MESSAGE), array_at(places, SIGNALS, SIGNAL)
     state, words = array_at(places, STATES, STATE), array_at(places, WORDS, U4)
-    tick, log = array_at(places, TICK, U1), array_at(places, LOG, FRAME)
+    tick, log, io = array_at(places, TICK, U1), array_at(places, LOG, FRAME), array_at(places, IO, I8)
     gather(values, tick, fields)
-    at_ns, size = now_ns(times), 0
+    at_ns, size = stamp_ns(io, times), 0
     for index in range(len(messages)):
         one = raw[FD_BYTES * index : FD_BYTES * (index + 1)]
         size = encode_command(one, values, index, messages, signals, state, words, log, at_ns)
@@ -305,19 +366,32 @@ def command(places: Any) -> Any:
     for at in range(min(FD_BYTES, len(sync))):
         sync[at] = raw[at]
     if len(sync) == 0 and len(messages) == 1:
-        code = transmit(fds, raw, size, state, log)
+        code = transmit(io, fds, raw, size, state, log)
     elif len(sync) == 0:
         code = transmit_all(places, at_ns)
     if code == DONE:
         state[0]["last_sent"], state[0]["controlword"] = int(values[0]), int(values[1])
+        if io[SILENT] != 0:
+            lead(tick, io[STATE_AT], int(values[1]))
     return code
+
+
+@jit
+def lead(tick: Any, at: int, controlword: int) -> None:
+    """A drive that does not say its state is taken to be where the command leads."""
+    on = controlword == ENABLE_OPERATION
+    tick[at : at + 4].view(np.uint32)[0] = ENABLED if on else of_controlword(controlword)
 
 
 @jit
 def transmit_all(places: Any, at_ns: int) -> Any:
     """Send the messages of a command that are due, each noted as it goes. Returns DONE or -errno."""
     fds, raw, state = array_at(places, FDS, I4), array_at(places, RAW, U1), array_at(places, STATES, STATE)
-    log, messages = array_at(places, LOG, FRAME), array_at(places, MESSAGES, MESSAGE)
+    log, messages, io = (
+        array_at(places, LOG, FRAME),
+        array_at(places, MESSAGES, MESSAGE),
+        array_at(places, IO, I8),
+    )
     seldom, held = array_at(places, SELDOM, U1), array_at(places, HELD, U1)
     for index in range(len(messages)):
         first = FD_BYTES * index
@@ -325,7 +399,8 @@ def transmit_all(places: Any, at_ns: int) -> Any:
         if seldom[index] != 0 and not differ(one, last):
             continue
         note(log, state[0], one, 0, at_ns)
-        code = transmit(fds, one, FD_BYTES if messages[index]["fd"] else CLASSIC_BYTES, state, log)
+        size = FD_BYTES if messages[index]["fd"] else CLASSIC_BYTES
+        code = transmit(io, fds, one, size, state, log)
         if code != DONE:
             return code
         for at in range(FD_BYTES):

@@ -11,9 +11,6 @@ from drivers.local import FD, FD_FDF, pack_frame
 class RawLink(Protocol):
     """Frames in SocketCAN's layout, from and to buffers that the caller owns."""
 
-    def pending(self) -> bool:
-        """True when there may be something to read, or an error to be seen by reading."""
-
     def receive_into(self, buffer: memoryview, timeout_ns: int) -> int:
         """Read the next frame; return its size, 0 after ``timeout_ns`` (0: at once). Raises LinkError."""
 
@@ -26,10 +23,6 @@ class Packed:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-
-    def pending(self) -> bool:
-        """Reading tells."""
-        return True
 
     def receive_into(self, buffer: memoryview, timeout_ns: int) -> int:
         """The next frame, laid out."""

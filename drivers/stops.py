@@ -15,18 +15,15 @@ from drivers.local import CLASSIC, FD
 from drivers.tables import laid_out
 
 STOP_PAUSE_S: Final = 0.002
-Send = Callable[[int], int]
 
 
 class Outgoing:
-    """One message to send: its frame in a buffer, and what lays a command out there."""
+    """One message to send: its frame in a buffer."""
 
     def __init__(self, message: Message, index: int) -> None:
         self.message, self.index = message, index
         self.raw = laid_out(message.send_id, message.length, message.fd)
         self.view = self.raw.data[: FD.size if message.fd else CLASSIC.size]
-        self.encode: Send = lambda t_ns: -1
-        self.note: Send = lambda t_ns: -1
 
     def lay(self, raw: npt.NDArray[np.uint8]) -> None:
         """Take a buffer that is laid out, its frame first."""

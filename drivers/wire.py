@@ -190,6 +190,12 @@ def put(tick: Any, g: Any, value: float) -> None:
 
 
 @jit
+def is_frame(raw: Any, size: int) -> bool:
+    """Whether what the socket gave is one: it may be any datagram."""
+    return size in (CLASSIC_BYTES, FD_BYTES) and int(raw[4]) <= size - DATA_AT
+
+
+@jit
 def identifier(raw: Any) -> int:
     """Identifier of a frame with SocketCAN's flag bits."""
     return int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
@@ -275,7 +281,7 @@ def take(
     other nodes' frames have no flags.
     """
     s = state[0]
-    if size not in (CLASSIC_BYTES, FD_BYTES) or int(raw[4]) > size - DATA_AT:
+    if not is_frame(raw, size):
         return 0
     if s["logged"] < len(log):
         note(log, s, raw, 1, t_ns)

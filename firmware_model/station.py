@@ -17,16 +17,16 @@ import numpy.typing as npt
 
 from drivers.bus import Link, SocketLink
 from drivers.local import pack_frame
-from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, transmit, wait
+from drivers.posix import DONE, EAGAIN, EINTR, now_ns, receive, wait, write
 from drivers.wire import (
     CLASSIC_BYTES,
-    DATA_AT,
     FD_BYTES,
     FRAME,
     MESSAGE,
     SIGNAL,
     find,
     identifier,
+    is_frame,
 )
 from drivers.wire import STATE as WIRE_STATE
 from firmware_model.config import Record
@@ -142,7 +142,7 @@ def send_answer(places: Any, status_due: int) -> bool:
         m = messages[index]
         if not m["bit"] & left_out:
             size = FD_BYTES if m["fd"] else CLASSIC_BYTES
-            cells[UNSENT] += transmit(fds, out[index * FD_BYTES :], size, wire, log) != DONE
+            cells[UNSENT] += write(fds, out[index * FD_BYTES :], size) != DONE
     return True
 
 
@@ -150,8 +150,7 @@ def send_answer(places: Any, status_due: int) -> bool:
 def send_beat(places: Any, now_ns: int) -> None:
     """The heartbeat, and when the next is due."""
     fds, cells, beat = array_at(places, _FDS, I4), array_at(places, _CELLS, I8), array_at(places, _BEAT, U1)
-    wire, log = array_at(places, _WIRE, WIRE_STATE), array_at(places, _LOG, FRAME)
-    cells[UNSENT] += transmit(fds, beat, len(beat), wire, log) != DONE
+    cells[UNSENT] += write(fds, beat, len(beat)) != DONE
     cells[BEAT_NS] = now_ns + HEARTBEAT_NS
 
 
@@ -217,8 +216,8 @@ def attend(places: Any, until_ns: int) -> Any:
         size = receive(fds, raw)
         if size < 0:
             return 0 if size in (-EAGAIN, -EINTR) else size
-        if size not in (CLASSIC_BYTES, FD_BYTES) or int(raw[4]) > size - DATA_AT:
-            continue  # no frame
+        if not is_frame(raw, size):
+            continue
         if identifier(raw) == cells[SYNC_ID] and int(raw[4]) <= 1:  # CANopen: no data or the counter
             if take_sync(places, now_ns(times)) != DONE:
                 return ANSWER

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
+from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+Cell = npt.NDArray[np.int64]
 LOCKSTEP_TIMEOUT_NS = 2_000_000_000
 
 
@@ -12,6 +17,8 @@ class RealClock:
     """CLOCK_MONOTONIC in integer nanoseconds."""
 
     name = "monotonic"
+    cell = np.zeros(0, np.int64)
+    """As of :class:`LockstepClock`; none, where the time is the system's."""
 
     now_ns = staticmethod(time.monotonic_ns)  # no frame of Python's between a stamp and the clock
 
@@ -27,20 +34,25 @@ class RealClock:
 
 
 class LockstepClock:
-    """Time is the tick's deadline: nothing sleeps, and what is logged is the same in every run."""
+    """Time is the tick's deadline: nothing sleeps, and what is logged is the same in every run.
+
+    ``cell`` holds it [ns], for compiled ticks, too.
+    """
 
     name = "lockstep"
 
     def __init__(self) -> None:
-        self._now_ns = 0
+        self.cell = np.zeros(1, np.int64)
+        self._cell: Any = self.cell.data
 
     def now_ns(self) -> int:
         """Return the last deadline waited for."""
-        return self._now_ns
+        now_ns: int = self._cell[0]
+        return now_ns
 
     def sleep_until(self, deadline_ns: int) -> int:
         """Go to the deadline without waiting."""
-        self._now_ns = deadline_ns
+        self._cell[0] = deadline_ns
         return deadline_ns
 
     def receive_deadline(self, deadline_ns: int, timeout_ns: int) -> int:

@@ -8,7 +8,8 @@ ports. Here are the parts of :func:`hil.runtime.rules.run_tick`: SYNC and feedba
 :class:`~hil.runtime.guardian.GuardedDrive` keeps them.
 At the first thing that is unusual it returns the stage that it reached, and the loop does the rest. Some
 ticks run in one call, without Python in between: what others may ask of a run meanwhile is memory that is
-looked at before each tick.
+looked at before each tick. Lockstep's time is a word of memory, and a bus that is no descriptor is called as
+:mod:`drivers.posix` says.
 """
 
 from __future__ import annotations
@@ -26,20 +27,18 @@ from drivers.client import FLUSH_AT
 from drivers.drive import Drive
 from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
 from drivers.posix import (
-    COMMANDED,
-    DONE,
     EAR,
     EINTR,
-    EXCHANGED,
     IO,
+    LEFT,
     MONOTONIC,
-    PENDING,
     STAMP,
     STATES,
     SYNCED,
     clock_ns,
     command,
     drain,
+    left,
     now_ns,
 )
 from drivers.posix import exchange as sync_and_drain
@@ -48,6 +47,7 @@ from hil.config.design import Machine
 from hil.log.push import HEADER, NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.log.ring import FAILED_AT
+from hil.runtime.clock import LOCKSTEP_TIMEOUT_NS, Cell, RealClock
 from hil.runtime.guardian import FIRED, Words, beats, commands, guardian_flags
 from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, timing_of
 from hil.runtime.rules import (
@@ -92,10 +92,11 @@ THREAD_CPUTIME, ABSOLUTE = 3, 1
 I8: Final = np.dtype(np.int64)
 
 (
-    RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, REQUEST, NUMBER,
-    ROWS,
-) = range(14)  # fmt: skip
-"""Rows of the table: places of the kernels' own tables of places, then of arrays."""
+    RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, REQUEST, CLOCK,
+    NUMBER, ROWS,
+) = range(15)  # fmt: skip
+"""Rows of the table: places of the kernels' own tables of places, then of arrays. CLOCK: the cell of a
+:class:`hil.runtime.clock.LockstepClock`, of no length in real time."""
 PARTS: Final = sys.modules[__name__]
 """The parts of a tick are functions of this module; a kernel takes a module, but no tuple of functions."""
 TOGETHER_NS: Final = 4_000_000
@@ -117,20 +118,21 @@ def whole_tick(
     pace: Pace,
     number: memoryview | None = None,
     marks: Marks | None = None,
+    clock: Cell = RealClock.cell,
 ) -> Whole:
-    """The ticks of a run on a socket in real time; others are the loop's alone.
+    """The ticks of a run; a client that is not compiled leaves them to the loop.
 
     The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
     ``number``: of the newest set-point that was asked for, in memory that outlives the run; no array of it
-    stays, which would keep it from being released.
+    stays, which would keep it from being released. ``clock``: the cell of the loop's.
     """
     ports = client.compiled()
-    receive = None if ports is None else ports.exchange if plan.pacing == "sync" else ports.receive
-    if ports is None or receive is None:
+    if ports is None:
         return none_compiled
+    receive = ports.exchange if plan.pacing == "sync" else ports.receive
     timing = timing_of(plan, client.timed is not None, ports.sync_bytes)
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
-    table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks)
+    table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks, clock)
     call = partial(_compiled(), table)
     call.__dict__["alive"] = (client, machine, recorder, alive)  # the places are of them
     return call
@@ -145,6 +147,7 @@ def table_of(
     pace: Pace,
     number: memoryview | None,
     marks: Marks | None,
+    clock: Cell,
 ) -> tuple[npt.NDArray[np.int64], Any]:
     """The table of a compiled tick, RECEIVE to NUMBER; beside it what must live as long.
 
@@ -152,7 +155,7 @@ def table_of(
     """
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks, asked = np.zeros(0, np.int64) if marks is None else marks, np.zeros(1, np.int64)
-    arrays = [np.zeros(4, np.int64), shared, timing, record, marks, pace, request.cell]
+    arrays = [np.zeros(4, np.int64), shared, timing, record, marks, pace, request.cell, clock]
     rows = [place_of(table.reshape(-1), I8) for table in tables]
     rows += [place_of(array, TICK if array is record else I8) for array in arrays]
     rows.append(place_of(asked if number is None else np.frombuffer(number, np.int64), I8))
@@ -203,6 +206,10 @@ def mark_often(marks: Any, count: int) -> None:
 def sleep(table: Any, deadline_ns: int) -> Any:
     """A part of a tick, as what follows: :class:`hil.runtime.rules.Parts`."""
     times, marks = array_at(table, TIMES_AT, I8), array_at(table, MARKS, I8)
+    clock = array_at(table, CLOCK, I8)
+    if len(clock) > 0:
+        clock[0] = deadline_ns
+        return deadline_ns
     woken_ns = now_ns(times)
     while woken_ns < deadline_ns:
         times[2], times[3] = deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000
@@ -216,13 +223,16 @@ def sleep(table: Any, deadline_ns: int) -> Any:
 
 @jit
 def now(table: Any) -> Any:
-    """CLOCK_MONOTONIC [ns]."""
-    return now_ns(array_at(table, TIMES_AT, I8))
+    """CLOCK_MONOTONIC, or the time that stands still [ns]."""
+    clock = array_at(table, CLOCK, I8)
+    return clock[0] if len(clock) > 0 else now_ns(array_at(table, TIMES_AT, I8))
 
 
 @jit
-def until(_table: Any, ns: int, wait_ns: int) -> Any:
-    """In real time."""
+def until(table: Any, ns: int, wait_ns: int) -> Any:
+    """In real time; where time stands still, as long as the drive may take to compute."""
+    if len(array_at(table, CLOCK, I8)) > 0:
+        return now_ns(array_at(table, TIMES_AT, I8)) + LOCKSTEP_TIMEOUT_NS
     return ns + wait_ns
 
 
@@ -233,8 +243,9 @@ def asked(table: Any, k: int) -> Any:
 
 
 @jit
-def begun(_table: Any, _t: Any) -> None:
-    """There is no other node."""
+def begun(table: Any, _t: Any) -> None:
+    """Nothing is left of the tick before: a guardian that fired may have kept the client from taking it."""
+    array_at(places_at(table, RECEIVE), IO, I8)[LEFT] = 0
 
 
 @jit
@@ -258,12 +269,10 @@ def receive(table: Any, t: Any, deadline_ns: int) -> Any:
 
 @jit
 def taken(table: Any, t: Any, code: int) -> Any:
-    """Whether a kernel of the client's is done; else the client concludes what it has begun."""
+    """Whether a kernel of the client's is done; else the client goes on from there."""
     words, marks = array_at(table, WORDS, I8), array_at(table, MARKS, I8)
     mark(marks, READING, array_at(table, TIMES_AT, I8))
-    if code != DONE:
-        if code != PENDING:
-            array_at(places_at(table, RECEIVE), IO, I8)[EXCHANGED] = code
+    if left(places_at(table, RECEIVE), code):
         return False
     if len(words) > 0:
         t["rx_flags"] |= guardian_flags(words)
@@ -296,9 +305,7 @@ def answer(table: Any, t: Any) -> Any:
     if t["send"] != 0:
         if len(words) > 0 and commands(words, now_ns(times), t["state"], t["counter"]):
             return False
-        code = command(places)
-        if code != DONE:
-            array_at(places, IO, I8)[COMMANDED] = code
+        if left(places, command(places)):
             return False
     t["sent_ns"] = since(now, table, t)
     mark(array_at(table, MARKS, I8), SEND, times)

@@ -18,15 +18,12 @@ import numpy.typing as npt
 
 from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
 from drivers.posix import (
-    COMMANDED,
     DONE,
-    EXCHANGED,
-    IO,
-    LATE,
-    PENDING,
     STATES,
+    before,
     command,
     drain,
+    left,
     opened,
 )
 from drivers.wire import STATE
@@ -34,6 +31,7 @@ from hil.control.law import LAW_PARAMS
 from hil.log.push import NOWHERE, push
 from hil.log.recorder import Recorder
 from hil.runtime import fused
+from hil.runtime.clock import Cell, RealClock
 from hil.runtime.fused import (
     COMMAND,
     CONTROL,
@@ -90,18 +88,19 @@ def whole_nodes(
     pace: Pace,
     number: memoryview | None = None,
     marks: Marks | None = None,
+    clock: Cell = RealClock.cell,
 ) -> Whole:
-    """The ticks of a run of several nodes, each on a socket of its own; others are the loop's alone."""
+    """The ticks of a run of several nodes; :func:`hil.runtime.fused.whole_tick`."""
     ports = [axis.client.compiled() for axis in axes]
     tables: list[npt.NDArray[np.int64]] = []
     alive: list[Any] = [axes, recorder]
     for place, (axis, port) in enumerate(zip(axes, ports, strict=True)):
-        if port is None or port.exchange is None:
+        if port is None:
             return none_compiled
         own = [port.exchange if place == 0 else port.receive, port.command, axis.machine.places()]
         own += recorder.places(port.log, place)
         timing = timing_of(plan, False, port.sync_bytes)
-        table, held = table_of(own, timing, axis.ticks, words, request, pace, number, marks)
+        table, held = table_of(own, timing, axis.ticks, words, request, pace, number, marks, clock)
         kept = axis.undo.places.reshape(-1)
         tables.append(np.concatenate([table, [place_of(kept, I8), (0, 0)]]))
         alive += [held, kept]
@@ -136,12 +135,6 @@ def tick_of(table: Any) -> Any:
 
 
 @jit
-def io_of(table: Any, row: int) -> Any:
-    """What a client's kernel was left with."""
-    return array_at(places_at(table, row), IO, I8)
-
-
-@jit
 def state_of(table: Any) -> Any:
     """What a client's kernels share."""
     return array_at(places_at(table, RECEIVE), STATES, STATE)[0]
@@ -169,26 +162,21 @@ def begun(table: Any, t: Any) -> None:
 
 @jit
 def waits(nodes: Any) -> bool:
-    """Whether a client has something to tell first: flags, a bus that was down, a frame to be judged."""
+    """Whether a client has something to tell first: flags, a bus that was down."""
     for i in range(len(nodes)):
-        table = places_at(nodes, i)
-        s = state_of(table)
-        if s["pending"] != 0 or s["down"] != 0 or io_of(table, RECEIVE)[LATE] != 0:
+        s = state_of(places_at(nodes, i))
+        if s["pending"] != 0 or s["down"] != 0:
             return True
     return False
 
 
 @jit
 def take_late(table: Any) -> Any:
-    """:meth:`drivers.client.DriveClient.follow`. Returns what :func:`drivers.posix.drain` does."""
-    s = state_of(table)
-    s["got"] = 0
-    code = drain(places_at(table, RECEIVE), 0, True)
-    if code != DONE:
-        io_of(table, RECEIVE)[LATE] = code
-        return code
-    s["got"] = 0
-    hand_on(table)
+    """:meth:`drivers.client.DriveClient.follow`. Returns what :func:`drivers.posix.before` does."""
+    places = places_at(table, RECEIVE)
+    code = before(places)
+    if not left(places, code):
+        hand_on(table)
     return code
 
 
@@ -202,10 +190,8 @@ def sync(table: Any, _t: Any, until_ns: int) -> Any:
         if take_late(places_at(nodes, i)) != DONE:
             return False
         pace[DID] += 1
-    code = opened(places_at(table, RECEIVE), array_at(table, PLAN, I8)[SYNC_BYTES])
-    if code != DONE:
-        if code != PENDING:
-            io_of(table, RECEIVE)[EXCHANGED] = code
+    places = places_at(table, RECEIVE)
+    if left(places, opened(places, array_at(table, PLAN, I8)[SYNC_BYTES])):
         return False
     hand_on(table)
     pace[DID] += 1
@@ -228,10 +214,8 @@ def listen(table: Any, until_ns: int, first: bool) -> Any:
         code = drain(places, NO_WAIT, False)
     if code == DONE and tick_of(table)["rx_flags"] & FRESH == 0:
         code = drain(places, until_ns, False)
-    if code != DONE:
-        io_of(table, RECEIVE)[EXCHANGED] = code
-        return code
-    hand_on(table)
+    if not left(places, code):
+        hand_on(table)
     return code
 
 
@@ -305,9 +289,8 @@ def answer(table: Any, t: Any) -> Any:
         if one["send"] != 0:
             if len(words) > 0 and words[FIRED] != 0:
                 return False
-            code = command(places_at(node, COMMAND))
-            if code != DONE:
-                io_of(node, COMMAND)[COMMANDED] = code
+            places = places_at(node, COMMAND)
+            if left(places, command(places)):
                 return False
             hand_on(node)
         one["sent_ns"] = since(now, table, t)

@@ -23,7 +23,7 @@ from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import Words
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes
-from hil.runtime.loop import Outcome, StopRequest, no_whole
+from hil.runtime.loop import Outcome, StopRequest
 from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
 from hil.runtime.nodesetup import Nodes, check_nodes_load
 from hil.runtime.progress import say
@@ -141,9 +141,9 @@ def _recorded(
         box = inbox if any(takes.values()) else None
         plan = plan_of(first.config)
         plan = replace(plan, together=fused.together(plan.period_ns, request))
-        whole = partial(fusednodes.whole_nodes, axes, words, recorder, plan, request, number=inbox.number)
-        real = whole if clock.name == "monotonic" else no_whole
-        loop = NodesLoop(axes, clock, recorder, plan, request, words, real, box)
+        compiled = partial(fusednodes.whole_nodes, axes, words, recorder, plan, request)
+        whole = partial(compiled, number=inbox.number, clock=clock.cell)
+        loop = NodesLoop(axes, clock, recorder, plan, request, words, whole, box)
         for client in clients:
             client.discard()
         ended = partial(_ended, axes, recorder, clock)

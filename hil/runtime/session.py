@@ -184,11 +184,10 @@ def _recorded(
         machine, plan = setup.machine.fresh(), plan_of(config)
         plan = replace(plan, together=fused.together(plan.period_ns, request))
         machine = machine if request.ramps else machine.at_once()
-        alone = watch is not None or clock.name != "monotonic"
         takes = set_by_others(setup)
         with contextlib.closing(Inbox(Place(machine, takes))) as inbox, _started(None if watch else client):
             compiled = partial(fused.whole_tick, client, words, machine, recorder, plan, request)
-            whole = no_whole if alone else partial(compiled, number=inbox.number)
+            whole = no_whole if watch else partial(compiled, number=inbox.number, clock=clock.cell)
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()

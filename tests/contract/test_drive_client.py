@@ -28,6 +28,7 @@ from tests.conftest import CONFIGS
 
 HOUSE = CONFIGS / "drives/hil_pmsm.dbc"
 FD = CONFIGS / "drives/hil_pmsm_fd.dbc"
+CURRENT = CONFIGS / "drives/hil_current.dbc"
 
 
 class Bench:
@@ -355,6 +356,21 @@ def test_the_command_is_the_ticks(bench: Bench) -> None:
     assert {
         k: values[k] for k in ("Counter", "Mode", "Controlword", "VoltageQ", "VoltageD")
     } == pytest.approx({"Counter": 7, "Mode": 0, "Controlword": 15, "VoltageQ": -3.27, "VoltageD": 1.5})
+
+
+@pytest.mark.parametrize("kind", ["hil-local", "virtual"])
+def test_a_drive_that_does_not_say_its_state_is_where_the_command_leads(kind: str, channel: str) -> None:
+    house = house_map(Database(CURRENT))
+    silent = replace(house, state="", u_q="", u_d="", i_q_ref="COMMAND.CurrentQ", i_d_ref="COMMAND.CurrentD")
+    bench = Bench(kind, channel, CURRENT, drive_map=silent)
+    bench.client.prepare(bench.tick)
+    states = [int(bench.tick["drive_state"])]
+    for controlword in (0x06, 0x07, 0x0F, 0x00, 0x80):
+        bench.tick["controlword"] = controlword
+        bench.client.send(bench.tick)
+        states.append(int(bench.tick["drive_state"]))
+    bench.close()
+    assert states == [1, 2, 3, 4, 1, 1]
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 400.0])

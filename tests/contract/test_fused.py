@@ -9,7 +9,9 @@ were left to the loop, so that a compiled tick that left everything to it would 
 from __future__ import annotations
 
 import contextlib
+import errno
 import multiprocessing
+import select
 import signal
 import socket
 import time
@@ -25,15 +27,25 @@ import numpy as np
 import pytest
 
 from drivers.bcm import SO_TIMESTAMPNS, TX_DELETE, KernelSync
-from drivers.bus import BusSettings, SocketLink, open_link
+from drivers.bus import (
+    BusSettings,
+    Frame,
+    Link,
+    SocketLink,
+    open_link,
+    raise_link_error,
+    unpack_frame,
+)
 from drivers.client import DriveClient
 from drivers.local import CLASSIC, pack_frame
+from drivers.lockstep import LockstepLink, tick_over
+from drivers.posix import LEFT
 from hil.log.check import first_broken
 from hil.log.reader import Log, open_log
 from hil.log.recorder import Recorder, open_recorder
 from hil.log.ring import FAILED_AT
 from hil.runtime import fused, inbox
-from hil.runtime.clock import RealClock
+from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import (
     BEAT_NS,
     FIRED,
@@ -82,6 +94,8 @@ class Drive:
         self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
         self.counter = self._echo = self._state = self._beats = self._deaf_until = 0
         self.operator, self.speed = StopRequest(), 0.0
+        self.tells, self._asked = False, b""
+        """Whether it says that a tick is over: in lockstep nobody waits for what was lost."""
         self.inbox: Inbox
         self.recorder: Recorder
         self.heard: list[int] = []
@@ -109,8 +123,10 @@ class Drive:
 
     def take(self, raw: bytes) -> int:
         """What a frame of the loop's asks; returns its identifier."""
-        can_id, _, data = CLASSIC.unpack(raw)
+        can_id, length, data = CLASSIC.unpack(raw)
         self.heard.append(can_id)
+        if can_id == SYNC:
+            self._asked = data[:length]
         if can_id == COMMAND:
             self._echo, self._state = data[1] & 15, STATES.get(data[2] | data[3] << 8, self._state)
         return int(can_id)
@@ -121,6 +137,8 @@ class Drive:
         self.words.cells[GUARD_NS] = TIME.now_ns
         with contextlib.suppress(OSError):  # the loop may have ended
             self._act(self, n)
+            if self.tells:
+                self.end.send(pack_frame(*tick_over(self._asked)))
 
     def after_command(self, act: Callable[[], None]) -> None:
         """Do that when the next command has come."""
@@ -466,6 +484,36 @@ def ends() -> Iterator[tuple[socket.socket, socket.socket]]:
         yield ours, theirs
 
 
+class Plain:
+    """A bus that is no descriptor: an end of the wire behind Python's own send and receive."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._end, self._poll = end, select.poll()
+        self._poll.register(end, select.POLLIN)
+        end.setblocking(False)
+
+    def send(self, can_id: int, data: bytes, fd: bool = False) -> None:
+        try:
+            self._end.send(pack_frame(can_id, data, fd))
+        except OSError as error:
+            raise_link_error(error, "send")
+
+    def receive(self, timeout_ns: int) -> Frame | None:
+        if timeout_ns:
+            TIME.pass_until(TIME.now_ns + timeout_ns, lambda: bool(self._poll.poll(0)))
+        try:
+            return unpack_frame(self._end.recv(128))
+        except BlockingIOError:
+            return None
+        except OSError as error:
+            raise_link_error(error, "receive")
+
+    def discard(self) -> int:
+        return 0
+
+    def close(self) -> None: ...
+
+
 def setup_of(*more: str) -> Setup:
     """The demo, patient with what is missing, at rest."""
     settings = ("feedback.hold_ticks=40", "reference.w_rad_s=0.0", *more)
@@ -493,12 +541,16 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         other = Timed if case[0] == "by the kernel" else Drive if pacing == "sync" else Cyclic
         drive = other(setup, theirs, words, act)
         sync = drive.sync if isinstance(drive, Timed) else None
-        link = SocketLink(None, ours, ours)
-        client = DriveClient(link, setup.database, on_frames=recorder.frames, timed=sync)
+        link: Link = Plain(ours) if case[0] in PLAIN else SocketLink(None, ours, ours)
+        clock = LockstepClock() if case[0] == "in lockstep" else RealClock()
+        if isinstance(clock, LockstepClock):
+            link, drive.tells = LockstepLink(link, SYNC), True
+        client = DriveClient(link, setup.database, on_frames=recorder.frames, now=clock.now_ns, timed=sync)
+        told = words if isinstance(clock, RealClock) else None  # where time stands still nobody watches
 
         def counted(pace: Pace) -> Whole:
-            parts = client, words, machine, recorder, plan, request, pace, page.number
-            made = fused.whole_tick(*parts)
+            parts = client, told, machine, recorder, plan, request, pace, page.number
+            made = fused.whole_tick(*parts, clock=clock.cell)
 
             def whole(*args: Any) -> int:
                 stage = made(*args)
@@ -511,9 +563,12 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
 
             return whole
 
-        guarded, record = GuardedDrive(client, words, time.monotonic_ns, sync), recorder.record
+        guarded, record = (
+            GuardedDrive(client, told, time.monotonic_ns, sync) if told else client,
+            recorder.record,
+        )
         whole = counted if compiled else no_whole
-        parts = guarded, RealClock(), recorder, machine.looped(), record, plan, request, whole
+        parts = guarded, clock, recorder, machine.looped(), record, plan, request, whole
         page = Inbox(Place(machine, ranges(machine, "cascade")))
         loop = Loop(*parts, page, sync)
         drive.operator, drive.inbox, drive.recorder = request, page, recorder
@@ -670,18 +725,31 @@ BY_THE_TIMER: dict[str, tuple[Act, set[int], str]] = {
 }
 
 
+PLAIN = ("no descriptor", "in lockstep")
+"""Where the bus is Python's; and in lockstep time is a word that goes from tick to tick."""
+STANDING_STILL = (
+    "calm", "wrong crc", "jump of the counter", "no feedback", "late feedback", "emergency",
+    "late frames and an emergency", "second master", "wrong length", "a set-point",
+)  # fmt: skip
+
+
 TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
     "by us": CASES,
     "by feedback": FOLLOWED,
     "by the kernel": BY_THE_KERNEL,
     "by the timer": BY_THE_TIMER,
+    "no descriptor": CASES,
+    "in lockstep": {name: CASES[name] for name in STANDING_STILL},
     "ramp": {"stop": (stopped, set(), "STOP_REQUESTED")},
     "seldom": {"emergency": (seldom, set(), "STOP_REQUESTED")},
 }
 """Who sends SYNC, or that nobody does; then what happens."""
 
 
-PACED = {"by us": "sync", "by feedback": "feedback", "by the kernel": "feedback", "by the timer": "timer"}
+PACED = {
+    "by us": "sync", "by feedback": "feedback", "by the kernel": "feedback", "by the timer": "timer",
+    "no descriptor": "sync", "in lockstep": "sync",
+}  # fmt: skip
 UNSURE = ("the other end is gone", "the queue is full", "the guardian fires")
 """Where the drive does not listen to the end, not all of the stages need come."""
 
@@ -734,7 +802,7 @@ def parts(tmp_path: Path) -> Iterator[Parts]:
         client = DriveClient(SocketLink(None, ours, ours), setup.database, on_frames=recorder.frames)
         client.prepare(recorder.record[0])
         whole = fused.whole_tick(client, words, machine, recorder, plan, request, pace)
-        yield Parts(whole, words, recorder.record, theirs, request, pace)
+        yield Parts(whole, words, recorder.record, theirs, request, pace, client)
         recorder.close({})
 
 
@@ -748,6 +816,7 @@ class Parts:
     end: socket.socket
     request: StopRequest
     pace: Pace
+    client: DriveClient
 
     def silent(self) -> bool:
         """Nothing was sent, nothing stored."""
@@ -778,6 +847,16 @@ def test_nothing_is_sent_once_the_guardian_has_fired(parts: Parts) -> None:
     assert parts.silent() and parts.words.cells[BEAT_NS] > 0
 
 
+def test_what_was_left_of_a_tick_is_not_the_next_ones(parts: Parts) -> None:
+    """A command that the bus refused, and the guardian fires before the loop hears of it."""
+    parts.words.cells[GUARD_NS] = time.monotonic_ns()
+    parts.client._port.io[LEFT] = -errno.ENOBUFS
+    parts.words.cells[FIRED] = 1
+    assert parts.whole(7, time.monotonic_ns(), False) == BEGUN
+    parts.client.receive(parts.record[0], 0)
+    assert parts.record["rx_flags"][0] == 0
+
+
 def test_a_signal_ends_the_sleep(parts: Parts) -> None:
     """So that its handler can run before the tick."""
     seen: list[int] = []
@@ -805,13 +884,16 @@ def test_a_tick_sleeps_to_its_deadline(parts: Parts) -> None:
 
 
 @pytest.mark.parametrize("pacing", PACINGS)
-def test_what_has_no_socket_is_the_loops(tmp_path: Path, channel: str, pacing: Pacing) -> None:
+def test_what_has_no_socket_is_compiled_too(tmp_path: Path, channel: str, pacing: Pacing) -> None:
+    """By python-can's own send and receive: see also the cases of :data:`PLAIN`."""
     setup, link = setup_of(), open_link(BusSettings("virtual", channel))
     machine, header = setup.machine, header_of(setup, "run", "x")
     recorder = open_recorder(tmp_path / "run.mcap", header, 1000)
     client, plan = DriveClient(link, setup.database), Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS)
     client.prepare(recorder.record[0])
     parts = client, None, machine, recorder, plan, StopRequest(), new_pace()
+    assert fused.whole_tick(*parts) is not none_compiled
+    client.compiled = lambda: None  # type: ignore[method-assign]
     assert fused.whole_tick(*parts) is none_compiled
     link.close()
     recorder.close({})

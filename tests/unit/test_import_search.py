@@ -141,7 +141,7 @@ class World:
         self.tape.lay(self.queue)
         self.queue.clear()
         self.client._cells[0] = 0
-        self.client._take_late(tick)
+        self.client.follow(tick)
         self._held("sync")
         self.client._send_sync()
         self._sent()
