@@ -40,6 +40,8 @@ PLACED = (
     REFERENCE, SETPOINT_PARAMS, SETPOINT_STATE, SAFETY_PARAMS, SAFETY_STATE, LAW_PARAMS, LAW_STATE,
 )  # fmt: skip
 """The records of one controller, in the order in which :func:`whole` takes them."""
+SLIP_S = 0.02
+"""Time constant with which it is forgotten what the angle moved by and the speed did not tell [s]."""
 
 __all__ = ["SAFETY_PARAMS", "SAFETY_STATE", "new_safety_state", "prepare", "step"]
 
@@ -110,11 +112,12 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 def estimate_angle(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """The angle over turns and its following error; until operation its reference begins where the shaft is.
 
-    What is no angle is left to the guard, as what it jumps by is: ``slip`` forgets a tenth of it a tick.
+    What is no angle is left to the guard, and so is what it jumps by, which ``slip`` forgets within SLIP_S.
     """
     ls["unseen"] += t["gap"]
     if t["rx_flags"] & RxFlag.FRESH and abs(t["theta"]) < MOST_ANGLE:
-        s["slip"] = 0.9 * s["slip"] + locate(lp, ls, t["theta"])
+        kept = max(1.0 - ls["unseen"] * p["T_s"] / SLIP_S, 0.0)
+        s["slip"] = kept * s["slip"] + locate(lp, ls, t["theta"])
     if s["reason"] == 0 and s["state"] != DriveState.OPERATION_ENABLED:
         ls["origin"] = ls["turned"] - t["theta_ref"]
     ls["theta_ref"] = t["theta_ref"]

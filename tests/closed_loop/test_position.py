@@ -117,9 +117,16 @@ def test_an_encoder_that_fails_stops_the_run(ticks: TickArray) -> None:
     assert ended(ticks, set_angle(lambda theta, row: theta + 1.0)) == (Reason.ANGLE_JUMP, 800)
     frozen = float(ticks["theta"][800])
     reason, row = ended(ticks, set_angle(lambda theta, row: frozen))
-    assert reason == Reason.ANGLE_JUMP and row < 815
+    assert reason == Reason.ANGLE_JUMP and row < 812
     wrong_way = set_angle(lambda theta, row: 2.0 * frozen - theta)
     assert ended(ticks, wrong_way)[0] == Reason.ANGLE_JUMP
+
+
+def test_a_soft_start_catches_up_without_a_jump() -> None:
+    run = operating(simulate_ticks(setup_of("limits.soft_start_s=1.0"), ["load=[]"]))
+    assert run["reason"][-1] == 0 or Reason(int(run["reason"][-1])) == Reason.STOP_REQUESTED
+    assert np.abs(np.diff(run["u_q"])).max() < 3.0 and np.abs(run["theta_error"]).max() < 0.1
+    assert abs(run["theta_error"][-1]) <= 2.0 * math.pi / 4096
 
 
 def test_a_lost_frame_is_no_jump(ticks: TickArray) -> None:

@@ -30,6 +30,7 @@ MOTOR = MotorModel(2.875, 0.033, 0.033, 0.8, 3, 0.011, 2e-4)
 FTDOB = ChannelSpec("ftdob", 25.0, 58.0, 0.012)
 T_S = 1e-3
 POLES = (40.0, 120.0)
+STEADY = reference("step", w=50.0)[0]
 
 
 def law(inner: InnerLoop, poles: tuple[float, float] = POLES) -> Any:
@@ -56,15 +57,15 @@ class Shaft:
         self.theta, self.w, self.i = (self._step @ [self.theta, self.w, i, acts, self.d])[:3]
 
 
-def errors(p: Any, shaft: Shaft, ticks: int, w_ref: float = 50.0) -> Any:
-    """theta - theta* of the law's own kernels against the plant, theta* = w* t."""
+def errors(p: Any, shaft: Shaft, ticks: int, profile: Any = STEADY) -> Any:
+    """theta - theta* of the law's own kernels against the plant."""
     s, u, out = new_law_state()[0], 0.0, []
     for k in range(ticks):
         s["ua"][0] = flowed(p, s, 0.0, False, 1)
         observe(p, s, shaft.w, 0.0, 0.0, True, 1)
         latched(p, s, u, True)
-        s["turned"], s["theta_ref"] = shaft.theta, w_ref * k * T_S
-        ask(p, s, w_ref, 0.0, 0.0, 1e9)
+        s["turned"], s["theta_ref"] = shaft.theta, turned_at(profile, k * T_S)
+        ask(p, s, *reference_at(profile, k * T_S), 0.0, 1e9)
         u = float(s["u"][1])
         out.append(shaft.theta - s["theta_ref"])
         shaft.tick(u)
@@ -83,6 +84,17 @@ def test_the_angle_error_has_the_poles_given_and_no_load_stays_in_it(
     late = e[60:160]
     left = sum(c * late[3 - j : len(late) - j] for j, c in enumerate(np.poly(roots)))
     assert np.abs(left).max() < 1e-9, "these eigenvalues, and no fourth"
+
+
+def test_the_jerk_that_is_fed_forward_follows_an_s_curve_closer() -> None:
+    inner = InnerLoop(3.6, 1.0, 1e-3, 0, told=False)
+    record = move(20.0, 40.0, 200.0, 2000.0, 0.1)
+    worst = []
+    for jerk in (0, 1):
+        p, shaft = law(inner), Shaft(inner, 0.0)
+        p["jerk"], shaft.theta, shaft.w = jerk, 0.0, 0.0
+        worst.append(np.abs(errors(p, shaft, 1200, record[0])).max())
+    assert worst[1] < 0.5 * worst[0] < 1e-3
 
 
 def test_a_wrong_estimate_leaves_the_angle_that_the_stiffness_says() -> None:
