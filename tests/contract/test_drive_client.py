@@ -346,6 +346,22 @@ def test_sync_counts_from_1_to_240(bench: Bench) -> None:
     assert got == [*range(1, 241), 1, 2]
 
 
+@pytest.mark.parametrize("kind", ["hil-local", "virtual"])
+def test_a_request_of_one_byte_is_no_counter(kind: str, channel: str) -> None:
+    class Asking(DriveClient):
+        def request(self) -> bytes:
+            return b"\x52"
+
+    bench = Bench(kind, channel, HOUSE)
+    client = Asking(open_link(BusSettings(kind, channel, fd=True)), bench.database)
+    for _ in range(2):
+        client.sync(bench.tick)
+    asked = [frame.data for frame in bench.heard() if frame.can_id == 0x080]
+    client.close()
+    bench.close()
+    assert asked == [b"\x52"] * 2
+
+
 def test_the_command_is_the_ticks(bench: Bench) -> None:
     tick = bench.tick
     tick["counter"], tick["controlword"], tick["u_q"], tick["u_d"], tick["T_L"] = 7, 15, -3.27, 1.5, 9.0
