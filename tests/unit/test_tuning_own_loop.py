@@ -94,6 +94,20 @@ def test_the_linear_loop_foretells_the_simulation(name: str, corner: str) -> Non
     assert seen.u_noise == pytest.approx(said.u_noise, rel=0.15)
 
 
+def test_the_linear_loop_of_an_angle_foretells_the_simulation() -> None:
+    """Both loops, the steps of the angle among the noise; its margins are those of hil check."""
+    setup, bench = drive("position", *QUICK)
+    law, plant = setup.machine.law, bench.plant(bench.motor)
+    said = judge(law, bench, [plant])
+    seen = seen_in(simulate_ticks(setup, plants_of(bench)["as believed"]), bench.T_s)
+    assert seen.dip == pytest.approx(said.nominal.dip, rel=0.05)
+    assert seen.u_noise == pytest.approx(said.u_noise, rel=0.15)
+    assert said.u_noise > 1.3 * judge(law, replace(bench, theta_noise=None), [plant]).u_noise
+    assert loops(law, bench, [plant])[0].ms == pytest.approx(
+        loop_through(setup.config, setup.machine, bench.filter).ms, rel=2e-3
+    )
+
+
 @pytest.mark.parametrize("period_us", [50, 100, 1000])
 def test_the_sampled_current_loop_is_the_emulated_drive_s(period_us: int) -> None:
     """Tick by tick, also while it accelerates: i_d and its coupling are of third order here."""
