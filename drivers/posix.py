@@ -45,6 +45,7 @@ _recv = _types.ExternalFunction("recv", _word(_int, _pointer, _pointer, _int))
 _recvmsg = _types.ExternalFunction("recvmsg", _word(_int, _pointer, _int))
 _send = _types.ExternalFunction("send", _word(_int, _pointer, _pointer, _int))
 _ppoll = _types.ExternalFunction("ppoll", _int(_pointer, _pointer, _pointer, _pointer))
+_poll = _types.ExternalFunction("poll", _int(_pointer, _pointer, _int))
 _clock_gettime = _types.ExternalFunction("clock_gettime", _int(_int, _pointer))
 _errno_location = _types.ExternalFunction("__errno_location", _types.CPointer(_int)())
 
@@ -139,6 +140,25 @@ def wait(fds: Any, times: Any, left_ns: int) -> Any:
     times[2], times[3] = left_ns // 1_000_000_000, left_ns % 1_000_000_000
     ready = _ppoll(fds[POLL_FD:].ctypes.data, 1, times[2:].ctypes.data, 0)
     return -errno() if ready < 0 else ready
+
+
+@jit
+def look(polled: Any) -> None:
+    """Ask several descriptors at once whether something is there; :func:`has_come` has the answer of each.
+
+    ``polled``: int32, a descriptor and room for each. It costs less than to read each in vain.
+    """
+    for at in range(1, len(polled), 2):
+        polled[at] = POLLIN
+    if _poll(polled.ctypes.data, len(polled) // 2, 0) < 0:  # not known: each may have something
+        for at in range(1, len(polled), 2):
+            polled[at] = 0
+
+
+@jit
+def has_come(io: Any, polled: Any, i: int) -> Any:
+    """Whether the i-th may have a frame or an error; a bus that is no descriptor always may."""
+    return io[RECEIVES] != 0 or polled[2 * i + 1] != POLLIN
 
 
 @jit
@@ -274,12 +294,12 @@ def rest(raw: Any) -> None:
 @waiting
 def exchange(places: Any, size: int, deadline_ns: int) -> Any:
     """:func:`opened`, then :func:`drain`, whose codes it returns once SYNC was sent."""
-    code = opened(places, size)
+    code = opened(places, size, True)
     return drain(places, deadline_ns, False) if code == DONE else code
 
 
 @jit
-def opened(places: Any, size: int) -> Any:
+def opened(places: Any, size: int, late: bool) -> Any:
     """:func:`before`, then :func:`begin`. PENDING, and nothing is done, where SYNC must wait.
 
     It waits for flags to be told, and a bus that was down.
@@ -287,16 +307,17 @@ def opened(places: Any, size: int) -> Any:
     s = array_at(places, STATES, STATE)[0]
     if s["pending"] != 0 or s["down"] != 0:
         return PENDING
-    code = before(places)
+    code = before(places, late)
     return begin(places, size) if code == DONE else code
 
 
 @jit
-def before(places: Any) -> Any:
-    """Take what waits as late. Returns DONE, or BEFORE and what can't be judged of it."""
-    s = array_at(places, STATES, STATE)[0]
+def before(places: Any, late: bool) -> Any:
+    """Take what waits as late, where there may be any. Returns DONE, or BEFORE and what can't be judged."""
+    s, code = array_at(places, STATES, STATE)[0], DONE
     s["got"] = 0
-    code = drain(places, 0, True)
+    if late:
+        code = drain(places, 0, True)
     s["got"] = 0
     return DONE if code == DONE else BEFORE + code
 

@@ -133,7 +133,7 @@ def whole_tick(
     timing = timing_of(plan, client.timed is not None, ports.sync_bytes)
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
     table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks, clock)
-    call = partial(_compiled(), table)
+    call = partial(compiled_of(run_ticks, ROWS), table)
     call.__dict__["alive"] = (client, machine, recorder, alive)  # the places are of them
     return call
 
@@ -162,15 +162,15 @@ def table_of(
     return np.array(rows), (tables, arrays, asked)
 
 
-def _compiled() -> Callable[..., int]:
-    """The compiled form; the call that makes it may run no tick."""
-    table = np.zeros((ROWS, 2), np.int64)
+def compiled_of(ticks: Any, rows: int) -> Callable[..., int]:
+    """The compiled form over tables of so many rows; the call that makes it may run no tick."""
+    table = np.zeros((rows, 2), np.int64)
     sizes = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEWS + 1, REQUEST: 1, NUMBER: 1}
     known = {row: np.zeros(size, np.int64) for row, size in sizes.items()}
     known[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
     for row, array in known.items():
         table[row] = place_of(array, I8)
-    compiled: Callable[..., int] = entry(run_ticks, table, 0, 0, False)
+    compiled: Callable[..., int] = entry(ticks, table, 0, 0, False)
     return compiled
 
 
@@ -182,7 +182,7 @@ def new_marks() -> Marks:
 def load() -> None:
     """Compile it, or load it."""
     if COMPILED:
-        _compiled()
+        compiled_of(run_ticks, ROWS)
 
 
 @jit

@@ -1,7 +1,8 @@
 """Ticks of several nodes as one compiled call: what :mod:`hil.runtime.nodes` does, where nothing is unusual.
 
-Like :mod:`hil.runtime.fused`, of whose pieces it is made, it has no rules of its own, and at the first thing
-that is unusual it returns the stage that it reached; the pace says how many steps of it are done. Each node
+Like :mod:`hil.runtime.fused`, of whose pieces it is made, it has no rules of its own, those of several nodes
+being :mod:`hil.runtime.noderules`, and at the first thing that is unusual it returns the stage that it
+reached; the pace says how many steps of it are done. Each node
 has a table as :func:`hil.runtime.fused.table_of` makes it, with what is kept of its controller's states
 behind it: :mod:`hil.tick.undo`.
 """
@@ -16,19 +17,24 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
+from drivers.jit import COMPILED, array_at, jit, place_of, places_at, waiting
 from drivers.posix import (
     DONE,
+    FDS,
+    IO,
+    RECEIVING,
     STATES,
     before,
     command,
     drain,
+    has_come,
     left,
+    look,
     opened,
 )
 from drivers.wire import STATE
 from hil.control.law import LAW_PARAMS
-from hil.log.push import NOWHERE, push
+from hil.log.push import push
 from hil.log.recorder import Recorder
 from hil.runtime import fused
 from hil.runtime.clock import Cell, RealClock
@@ -39,13 +45,11 @@ from hil.runtime.fused import (
     I8,
     LAW,
     MARKS,
-    NUMBER,
     PACE,
     PLAN,
     READING,
     RECEIVE,
     RECORD,
-    REQUEST,
     ROWS,
     SEND,
     TICK_AT,
@@ -53,28 +57,29 @@ from hil.runtime.fused import (
     TIMES_AT,
     WORDS,
     Marks,
+    compiled_of,
     mark,
     table_of,
     ticks_of,
 )
-from hil.runtime.guardian import ARMED, BEAT_NS, DISARMED, FIRED, Words, beats, guardian_flags
+from hil.runtime.guardian import Words
 from hil.runtime.loop import Plan, StopRequest, Whole, none_compiled, timing_of
-from hil.runtime.nodes import ALONE, COUNTERS, LEFT, Axis
-from hil.runtime.rules import DID, FRESH, NEWS, NO_WAIT, PLANNED, SYNC_BYTES, Pace, begin, since, stamp
+from hil.runtime.noderules import answer_all, begin_all, exchange, law_of_all, tell_all
+from hil.runtime.nodes import Axis
+from hil.runtime.rules import FRESH, NEWS, NO_WAIT, SYNC_BYTES, Pace, since
 from hil.runtime.trouble import TROUBLE
 from hil.signals import TICK
 from hil.tick.kernel import PLACED, whole_at
-from hil.tick.pair import ask, leads
-from hil.tick.pair import tell as tell_load
 from hil.tick.undo import keep
 
-KEPT, NODES, NODE_ROWS = ROWS, ROWS + 1, ROWS + 2
+KEPT, NODES, POLLED, NODE_ROWS = range(ROWS, ROWS + 4)
 """Behind a node's table: the places of what is kept of its controller's states; behind the first's that of
-the nodes' tables, too."""
+the nodes' tables and of what :func:`drivers.posix.look` asks with, too."""
 LAW_AT: Final = PLACED.index(LAW_PARAMS)
-QUIET, STOPPED, ENDS = ALONE
+I4: Final = np.dtype(np.int32)
 PARTS: Final = sys.modules[__name__]
-"""As :data:`hil.runtime.fused.PARTS`; these are as there, of the first node."""
+"""As :data:`hil.runtime.fused.PARTS`, and those of :mod:`hil.runtime.noderules`; these are as there, of
+the first node."""
 sleep, now, until, asked = fused.sleep, fused.now, fused.until, fused.asked
 receive, synced = fused.receive, fused.synced
 
@@ -102,201 +107,172 @@ def whole_nodes(
         timing = timing_of(plan, False, port.sync_bytes)
         table, held = table_of(own, timing, axis.ticks, words, request, pace, number, marks, clock)
         kept = axis.undo.places.reshape(-1)
-        tables.append(np.concatenate([table, [place_of(kept, I8), (0, 0)]]))
+        tables.append(np.concatenate([table, [place_of(kept, I8), (0, 0), (0, 0)]]))
         alive += [held, kept]
     nodes = np.array([place_of(table.reshape(-1), I8) for table in tables])
-    tables[0][NODES] = place_of(nodes.reshape(-1), I8)
-    call = partial(_compiled(), tables[0])
-    call.__dict__["alive"] = (alive, tables, nodes)  # the places are of them
+    polled = np.zeros(2 * len(nodes), np.int32)
+    tables[0][NODES], tables[0][POLLED] = place_of(nodes.reshape(-1), I8), place_of(polled, I4)
+    call = partial(compiled_of(run_together, NODE_ROWS), tables[0])
+    call.__dict__["alive"] = (alive, tables, nodes, polled)  # the places are of them
     return call
-
-
-def _compiled() -> Any:
-    """The compiled form; the call that makes it may run no tick."""
-    table = np.zeros((NODE_ROWS, 2), np.int64)
-    known = {TIMES_AT: 4, PLAN: PLANNED, PACE: NEWS + 1, REQUEST: 1, NUMBER: 1}
-    arrays = {row: np.zeros(size, np.int64) for row, size in known.items()}
-    arrays[TICKS_IN] = np.array([place_of(*one) for one in NOWHERE]).reshape(-1)
-    for row, array in arrays.items():
-        table[row] = place_of(array, I8)
-    return entry(run_together, table, 0, 0, False)
 
 
 def load() -> None:
     """Compile it, or load it."""
     if COMPILED:
-        _compiled()
+        compiled_of(run_together, NODE_ROWS)
 
 
 @jit
-def tick_of(table: Any) -> Any:
-    """A node's tick."""
-    return array_at(table, TICK_AT, TICK)[0]
+def node_at(table: Any, i: int) -> Any:
+    """A node's table."""
+    return places_at(places_at(table, NODES), i)
 
 
 @jit
-def state_of(table: Any) -> Any:
+def state_of(node: Any) -> Any:
     """What a client's kernels share."""
-    return array_at(places_at(table, RECEIVE), STATES, STATE)[0]
+    return array_at(places_at(node, RECEIVE), STATES, STATE)[0]
 
 
 @jit
-def hand_on(table: Any) -> None:
+def hand_on(node: Any) -> None:
     """A node's frames into their ring, before another's follow."""
-    s = state_of(table)
+    s = state_of(node)
     if s["logged"] > 0:
-        push(places_at(table, FRAMES_IN), s["logged"])
+        push(places_at(node, FRAMES_IN), s["logged"])
         s["logged"] = 0
 
 
 @jit
-def begun(table: Any, t: Any) -> None:
-    """Of :class:`hil.runtime.rules.Parts`, as are :func:`sync`, :func:`law` and the last four."""
-    nodes, pace = places_at(table, NODES), array_at(table, PACE, I8)
-    pace[DID] = 0
-    for i in range(1, len(nodes)):
-        one = tick_of(places_at(nodes, i))
-        stamp(one, t["k"], t["t_ns"], t["gap"], t["lateness_ns"])
-        begin(one, t["request"], t["log_failed"])
+def words(table: Any) -> Any:
+    """Of the parts of :mod:`hil.runtime.noderules`, as what follows."""
+    return array_at(table, WORDS, I8)
 
 
 @jit
-def waits(nodes: Any) -> bool:
-    """Whether a client has something to tell first: flags, a bus that was down."""
-    for i in range(len(nodes)):
-        s = state_of(places_at(nodes, i))
-        if s["pending"] != 0 or s["down"] != 0:
-            return True
-    return False
+def node(table: Any, i: int) -> Any:
+    """A node's tick."""
+    return ticks(table, i)[0]
 
 
 @jit
-def take_late(table: Any) -> Any:
-    """:meth:`drivers.client.DriveClient.follow`. Returns what :func:`drivers.posix.before` does."""
+def ticks(table: Any, i: int) -> Any:
+    """A node's record."""
+    return array_at(node_at(table, i), TICK_AT, TICK)
+
+
+@jit
+def law_of(table: Any, i: int) -> Any:
+    """A node's law."""
+    return array_at(places_at(node_at(table, i), LAW), LAW_AT, LAW_PARAMS)
+
+
+@jit
+def came(table: Any, i: int) -> Any:
+    """Whether something of a node may have come late."""
+    return has_come(array_at(places_at(node_at(table, i), RECEIVE), IO, I8), array_at(table, POLLED, I4), i)
+
+
+@jit
+def take_late(table: Any, i: int) -> Any:
+    """:meth:`drivers.client.DriveClient.follow`, unless the client has something to tell first."""
+    one = node_at(table, i)
+    s, places = state_of(one), places_at(one, RECEIVE)
+    if s["pending"] != 0 or s["down"] != 0 or left(places, before(places, came(table, i))):
+        return False
+    hand_on(one)
+    return True
+
+
+@jit
+def send_sync(table: Any, fired: bool) -> Any:
+    """SYNC by :func:`drivers.posix.opened`."""
     places = places_at(table, RECEIVE)
-    code = before(places)
-    if not left(places, code):
-        hand_on(table)
-    return code
+    if fired or left(places, opened(places, array_at(table, PLAN, I8)[SYNC_BYTES], came(table, 0))):
+        return False
+    hand_on(table)
+    return True
+
+
+@jit
+def listen(table: Any, i: int, until_ns: int) -> Any:
+    """A node's feedback; but for the last, which is listened to first, it is there already."""
+    one, code = node_at(table, i), DONE
+    places = places_at(one, RECEIVE)
+    if i < len(places_at(table, NODES)) - 1:
+        code = drain(places, NO_WAIT, False)
+    if code == DONE and node(table, i)["rx_flags"] & FRESH == 0:
+        code = drain(places, until_ns, False)
+    if left(places, code):
+        return False
+    hand_on(one)
+    return True
+
+
+@jit
+def decide(table: Any, i: int, kept: bool) -> None:
+    """A node's controller; what is new of it is noted."""
+    one = node_at(table, i)
+    record = array_at(one, TICK_AT, TICK)
+    t = record[0]
+    state, before = t["state"], t["reason"]
+    if kept:
+        keep(places_at(one, KEPT), t["gap"])
+    whole_at(places_at(one, LAW), record)
+    if t["reason"] != before or t["state"] != state or t["rx_flags"] & TROUBLE != 0:
+        array_at(table, PACE, I8)[NEWS] = 1
+
+
+@jit
+def send(table: Any, i: int, fired: bool) -> Any:
+    """A node's command."""
+    one = node_at(table, i)
+    places = places_at(one, COMMAND)
+    if fired or left(places, command(places)):
+        return False
+    hand_on(one)
+    return True
+
+
+@jit
+def begun(table: Any, t: Any) -> None:
+    """Of :class:`hil.runtime.rules.Parts`, as what follows: the rules of several over the parts above."""
+    pace, count = array_at(table, PACE, I8), len(places_at(table, NODES))
+    pace[NEWS] = 0
+    for i in range(count):
+        fused.begun(node_at(table, i), t)
+    begin_all(PARTS, table, t, pace, count)
 
 
 @jit
 def sync(table: Any, _t: Any, until_ns: int) -> Any:
-    """SYNC and the feedback of all."""
-    nodes, words, pace = places_at(table, NODES), array_at(table, WORDS, I8), array_at(table, PACE, I8)
-    if waits(nodes) or (len(words) > 0 and beats(words, now(table))):
+    """SYNC and the feedback of all; what came late is asked of all sockets at once."""
+    count, polled = len(places_at(table, NODES)), array_at(table, POLLED, I4)
+    for i in range(count):
+        polled[2 * i] = array_at(places_at(node_at(table, i), RECEIVE), FDS, I4)[RECEIVING]
+    look(polled)
+    if not exchange(PARTS, table, array_at(table, PACE, I8), count, until_ns):
         return False
-    for i in range(1, len(nodes)):
-        if take_late(places_at(nodes, i)) != DONE:
-            return False
-        pace[DID] += 1
-    places = places_at(table, RECEIVE)
-    if left(places, opened(places, array_at(table, PLAN, I8)[SYNC_BYTES])):
-        return False
-    hand_on(table)
-    pace[DID] += 1
-    for i in range(len(nodes) - 1, -1, -1):
-        if listen(places_at(nodes, i), until_ns, i == len(nodes) - 1) != DONE:
-            return False
-        pace[DID] += 1
-    if len(words) > 0:
-        for i in range(len(nodes)):
-            tick_of(places_at(nodes, i))["rx_flags"] |= guardian_flags(words)
+    tell_all(PARTS, table, count)
     mark(array_at(table, MARKS, I8), READING, array_at(table, TIMES_AT, I8))
     return True
 
 
 @jit
-def listen(table: Any, until_ns: int, first: bool) -> Any:
-    """A node's feedback; but for the ``first`` that is listened to it is there already. As drain returns."""
-    places, code = places_at(table, RECEIVE), DONE
-    if not first:
-        code = drain(places, NO_WAIT, False)
-    if code == DONE and tick_of(table)["rx_flags"] & FRESH == 0:
-        code = drain(places, until_ns, False)
-    if not left(places, code):
-        hand_on(table)
-    return code
-
-
-@jit
-def ticks_at(nodes: Any, i: int) -> Any:
-    """A node's record."""
-    return array_at(places_at(nodes, i), TICK_AT, TICK)
-
-
-@jit
-def law_at(nodes: Any, i: int) -> Any:
-    """A node's law."""
-    return array_at(places_at(places_at(nodes, i), LAW), LAW_AT, LAW_PARAMS)
-
-
-@jit
-def lead_of(nodes: Any) -> Any:
-    """The node whose law commands the other one, too; -1: none."""
-    for i in range(len(nodes)):
-        if leads(law_at(nodes, i)):
-            return i
-    return -1
-
-
-@jit
 def law(table: Any, t: Any) -> Any:
-    """Each node's controller; not all that is to be done where the others must stop with one."""
-    nodes, pace = places_at(table, NODES), array_at(table, PACE, I8)
-    left, going, pace[NEWS] = False, False, 0
-    for i in range(1, len(nodes)):
-        tick_of(places_at(nodes, i))["received_ns"] = t["received_ns"]
-    lead = lead_of(nodes)
-    first, load = max(lead, 0), 1 - lead
-    for n in range(len(nodes)):
-        i = (first + n) % len(nodes)
-        if lead >= 0 and n == 0:
-            tell_load(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
-        elif lead >= 0:
-            ask(ticks_at(nodes, lead), ticks_at(nodes, load), law_at(nodes, load))
-        one = places_at(nodes, i)
-        ticks = array_at(one, TICK_AT, TICK)
-        state, before = ticks[0]["state"], ticks[0]["reason"]
-        keep(places_at(one, KEPT), ticks[0]["gap"])
-        whole_at(places_at(one, LAW), ticks)
-        reason = ticks[0]["reason"]
-        left |= reason not in (QUIET, STOPPED, ENDS)
-        going |= reason == QUIET
-        if reason != before or ticks[0]["state"] != state or ticks[0]["rx_flags"] & TROUBLE != 0:
-            pace[NEWS] = 1
-    pace[DID] = LEFT if left and going else 0
+    """Each node's controller."""
+    done = law_of_all(PARTS, table, t, array_at(table, PACE, I8), len(places_at(table, NODES)))
     mark(array_at(table, MARKS, I8), CONTROL, array_at(table, TIMES_AT, I8))
-    return pace[DID] != LEFT
+    return done
 
 
 @jit
 def answer(table: Any, t: Any) -> Any:
-    """The commands, in the nodes' order."""
-    nodes, words, pace = places_at(table, NODES), array_at(table, WORDS, I8), array_at(table, PACE, I8)
-    armed = 0
-    for i in range(len(nodes)):
-        one = tick_of(places_at(nodes, i))
-        one["computed_ns"] = t["computed_ns"]
-        armed |= int(one["state"] != DISARMED)
-        if len(words) > 0:
-            words[COUNTERS + i] = one["counter"]
-    if len(words) > 0:
-        words[BEAT_NS], words[ARMED] = now(table), armed
-    for i in range(len(nodes)):
-        node = places_at(nodes, i)
-        one = tick_of(node)
-        if one["send"] != 0:
-            if len(words) > 0 and words[FIRED] != 0:
-                return False
-            places = places_at(node, COMMAND)
-            if left(places, command(places)):
-                return False
-            hand_on(node)
-        one["sent_ns"] = since(now, table, t)
-        pace[DID] += 1
+    """The commands."""
+    done = answer_all(PARTS, table, t, array_at(table, PACE, I8), len(places_at(table, NODES)))
     mark(array_at(table, MARKS, I8), SEND, array_at(table, TIMES_AT, I8))
-    return True
+    return done
 
 
 @jit
@@ -308,13 +284,12 @@ def tell(table: Any, t: Any, _state: int, request: int) -> Any:
 @jit
 def store(table: Any, t: Any) -> None:
     """The records into their rings; when the first was stored stands in all."""
-    nodes = places_at(table, NODES)
     push(places_at(table, TICKS_IN), 1)
-    stored_ns = since(now, table, t)
-    for i in range(1, len(nodes)):
-        push(places_at(places_at(nodes, i), TICKS_IN), 1)
-    for i in range(len(nodes)):
-        tick_of(places_at(nodes, i))["recorded_ns"] = stored_ns
+    stored_ns, count = since(now, table, t), len(places_at(table, NODES))
+    for i in range(1, count):
+        push(places_at(node_at(table, i), TICKS_IN), 1)
+    for i in range(count):
+        node(table, i)["recorded_ns"] = stored_ns
     mark(array_at(table, MARKS, I8), RECORD, array_at(table, TIMES_AT, I8))
 
 

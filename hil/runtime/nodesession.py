@@ -24,7 +24,8 @@ from hil.runtime.guardian import Words
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes
 from hil.runtime.loop import Outcome, StopRequest
-from hil.runtime.nodes import COUNTERS, Axis, NodesLoop
+from hil.runtime.noderules import COUNTERS
+from hil.runtime.nodes import Axis, NodesLoop
 from hil.runtime.nodesetup import Nodes, check_nodes_load
 from hil.runtime.progress import say
 from hil.runtime.refusals import check_arming, check_reachable, check_set_up, needed_bytes

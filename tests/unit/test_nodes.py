@@ -31,9 +31,11 @@ from hil.errors import ConfigError
 from hil.log.mcapfile import RunFile
 from hil.log.reader import open_log
 from hil.runtime.bus import deaf
-from hil.runtime.nodes import Together
+from hil.runtime.noderules import exchange
+from hil.runtime.nodes import NodesLoop
 from hil.runtime.nodesetup import load_node_setups, nodes_load
 from hil.runtime.refusals import load_found
+from hil.runtime.rules import new_pace
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, RxFlag, new_ticks
 from hil.sim.emulate import make_bench
@@ -422,8 +424,8 @@ def test_what_came_late_is_logged_before_the_next_sync() -> None:
         def __getattr__(self, what: str) -> Any:
             return lambda *_: did.append(f"{self.name} {what}")
 
-    clients = [SimpleNamespace(client=Noted(name), tick=None) for name in ("motor", "load")]
-    Together(clients, None).exchange(None, 0)  # type: ignore[arg-type]
+    axes = [SimpleNamespace(client=Noted(name), tick=None) for name in ("motor", "load")]
+    assert exchange(NodesLoop, SimpleNamespace(_axes=axes, _words=()), new_pace(), 2, 0)
     assert did == [
         "load follow", "load flush", "motor sync", "motor flush", "load receive", "load flush",
         "motor receive", "motor flush",

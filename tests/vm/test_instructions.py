@@ -88,6 +88,6 @@ def test_each_node_of_those_that_are_counted_answers_in_time(
         assert replay_log(log).verdict == "same"
 
 
-def test_two_nodes_cost_little_more_than_half_more_than_one(counted: dict[str, Any]) -> None:
-    """Of the same drive in the same boot: 1.53 x; the goal is 1.5."""
-    assert total_of(of_bus(counted, "nodes")) < 1.6 * total_of(of_bus(counted, "node"))
+def test_two_nodes_cost_less_than_half_more_than_one(counted: dict[str, Any]) -> None:
+    """Of the same drive in the same boot: 1.46 x."""
+    assert total_of(of_bus(counted, "nodes")) < 1.5 * total_of(of_bus(counted, "node"))
