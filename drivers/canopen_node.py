@@ -35,7 +35,8 @@ SHOWS_MODE_S: Final = 0.5
 _ENABLED: Final = (4, 5)
 _FAULTS: Final = (6, 7)
 _IDENTITY: Final = {1: "vendor", 2: "product", 3: "revision", 4: "serial"}
-_SUPPORTED, _ERROR = 0x6502, 0x603F
+_SYNC, _SUPPORTED, _ERROR = 0x1005, 0x6502, 0x603F
+_MAKES_SYNC, _COB_ID = 1 << 30, (1 << 30) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +104,21 @@ def refuse_other_device(sdo: Sdo, eds: Dictionary) -> None:
                 f"{eds.path}: is of {name} 0x{expected:X}, node {sdo.node_id} is 0x{found:X} (1018h:{sub}); "
                 "take the drive's own EDS, or mend drive.node_id"
             )
+
+
+def refuse_other_sync(sdo: Sdo) -> None:
+    """SYNC is ours, and 80h: a node may not make it, which it would with a period in 1006h. Raises NodeError.
+
+    1005h: the identifier, and bit 30 of a node that makes SYNC (CiA 301).
+    """
+    found = sdo.optional_int(_SYNC)
+    if found is None or found & (_MAKES_SYNC | _COB_ID) == SYNC_ID:
+        return
+    wrong = "makes SYNC itself" if found & _MAKES_SYNC else "takes another frame as SYNC"
+    raise NodeError(
+        f"node {sdo.node_id} {wrong} (1005h = 0x{found:X}): nothing was changed; set its 1005h to "
+        f"0x{SYNC_ID:X}: the controller sends SYNC"
+    )
 
 
 def refuse_running(sdo: Sdo) -> None:

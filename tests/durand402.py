@@ -27,7 +27,10 @@ RATED_N_M, MILLI_RPM = 13.68, math.pi / 30e3
 LOAD_N_M, LOAD_S = 5.4, (1.0, 2.0)
 STEPS = {(1, 0x06): 2, (2, 0x07): 3, (3, 0x0F): 4}
 WORDS = {1: 0x0240, 2: 0x0221, 3: 0x0233, 4: 0x1237}
+MOST_US = 5000
+"""The longest period of SYNC that it takes (1006h)."""
 OBJECTS = (
+    (0x1006, Type.UNSIGNED32, "rw", 0, "Communication cycle period"),
     (0x6040, Type.UNSIGNED16, "rw", 0, "Controlword"), (0x6041, Type.UNSIGNED16, "ro", 0x240, "Statusword"),
     (0x6060, Type.INTEGER8, "rw", 0, "Modes of operation"), (0x6061, Type.INTEGER8, "ro", 0, "Mode display"),
     (0x606C, Type.INTEGER32, "ro", 0, "Velocity actual"), (0x6071, Type.INTEGER16, "rw", 0, "Target torque"),
@@ -72,7 +75,8 @@ class Drive:
         self.node = durand.MinimalNode(wire, NODE)
         od = self.od = self.node.object_dictionary
         for index, kind, access, value, name in OBJECTS:
-            od[index] = durand.Variable(kind, access, value, name=name)
+            most = MOST_US if index == 0x1006 else None
+            od[index] = durand.Variable(kind, access, value, maximum=most, name=name)
         period = durand.Record(name="Interpolation time period")
         period[1] = durand.Variable(Type.UNSIGNED8, "rw", 1, name="Value")
         period[2] = durand.Variable(Type.INTEGER8, "rw", -3, name="Index")

@@ -212,9 +212,10 @@ def _refuse_others(job: Job, link: Link) -> None:
 
 
 def _known(job: Job, sdo: Sdo) -> None:
-    """One node of this number, of the device that the EDS is of."""
+    """One node of this number, of the device that the EDS is of, that takes our SYNC."""
     sdo.alone()
     node.refuse_other_device(sdo, job.eds)
+    node.refuse_other_sync(sdo)
 
 
 def _scales(job: Job, sdo: Sdo) -> Scales:

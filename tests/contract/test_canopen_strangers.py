@@ -63,7 +63,6 @@ def tick(bus: can.BusABC, say: Callable[[int, bytes], None], word: int, torque: 
     [
         (["canopen.rpdo_timeout_ms=10"], "has no object 1400h:5 (deadline of the command"),
         (['canopen.mode="csv"'], "has no object 60FFh (RPDO1)"),
-        (["canopen.sync_period=true"], "has no object 1006h (SYNC every [us])"),
         (['canopen.tpdo=[["6041","6079"]]'], "has no object 6079h (TPDO1)"),
     ],
 )
@@ -71,6 +70,20 @@ def test_what_it_does_not_have(configs: Path, channel: str, eds: str, settings: 
     with pytest.raises(Refused) as refused:
         configure(job(configs, channel, eds, *settings), store=False, dbc=None)
     assert said in str(refused.value)
+
+
+def test_the_period_of_sync(configs: Path, channel: str, eds: str) -> None:
+    """Held as it was written; one that their server does not take is told with its abort's words."""
+    made = job(configs, channel, eds, "canopen.sync_period=true")
+    result = configure(made, store=False, dbc=configs / "drives" / "cia402.dbc")
+    assert ("1006h", 1000, 1000) in [(str(o.entry.place), o.wanted, o.found) for o in result.objects]
+    assert compare(made).problems == []
+    with pytest.raises(NodeError) as refused:
+        configure(
+            job(configs, channel, eds, "canopen.sync_period=true", "loop.rate_hz=100"), store=False, dbc=None
+        )
+    assert "1006h can't be set to 0x2710: abort 0x06090031, " in str(refused.value)
+    assert not [problem for problem in compare(made).problems if "1006h" in problem], "it holds the old one"
 
 
 def test_it_can_store_nothing(configs: Path, channel: str, eds: str) -> None:

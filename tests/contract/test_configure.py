@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import can
+import canopen
 import cantools
 import pytest
 from canopen import SdoAbortedError
@@ -126,6 +127,61 @@ def reset(channel: str) -> None:
     with can.Bus(channel, "hil-local") as bus:
         bus.send(can.Message(arbitration_id=0, data=[0x81, NODE], is_extended_id=False))
     time.sleep(0.05)
+
+
+@pytest.mark.parametrize(("rate_hz", "period_us"), [(1000, 1000), (4000, 250)])
+def test_the_period_of_sync_where_it_is_wanted(
+    configs: Path, channel: str, rate_hz: int, period_us: int
+) -> None:
+    """1006h in microseconds (CiA 301): read back by strangers, too, lost at power-off, kept when stored."""
+    wish = ("canopen.sync_period=true", f"loop.rate_hz={rate_hz}")
+    made = job(configs, channel, *wish)
+    with emulated(configs, channel), recorded(channel) as frames:
+        result = set_up(configs, channel, *wish)
+        with canopen.Network() as network:
+            network.connect(interface="hil-local", channel=channel)
+            assert network.add_node(NODE, str(EDS)).sdo[0x1006].raw == period_us
+        reset(channel)
+        lost = compare(made).problems
+        assert set_up(configs, channel, *wish, store=True).stored
+        reset(channel)
+        assert compare(made).problems == []
+        other = compare(job(configs, channel, "canopen.sync_period=true", "loop.rate_hz=2000")).problems
+    (held,) = [one for one in result.objects if str(one.entry.place) == "1006h"]
+    assert (held.wanted, held.found) == (period_us, period_us) and not result.problems
+    assert (0x1006, 0, period_us) in writes(frames)
+    assert f"1006h is 0x0, not {period_us:#x} (SYNC every [us])" in lost
+    assert f"1006h is {period_us:#x}, not 0x1f4 (SYNC every [us])" in other
+
+
+def test_strangers_hold_the_period_of_sync_or_refuse_it(configs: Path, channel: str) -> None:
+    """Without the wish nobody's is touched: `test_pdos_are_changed_in_the_order_of_the_standard`."""
+    with stranger(channel) as node:
+        node.sdo[0x6061].raw = 10
+        assert set_up(configs, channel, "canopen.sync_period=true").written
+        assert node.sdo[0x1006].raw == 1000
+        node.add_write_callback(refusing(0x1006, 0, 0x06090030))
+        heard = asked(configs, channel, "canopen.sync_period=true")
+    assert "1006h can't be set to 0x3E8: abort 0x06090030, Value range of parameter" in heard
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "said"),
+    [
+        (0x40000080, "node 5 makes SYNC itself (1005h = 0x40000080)"),
+        (0x81, "node 5 takes another frame as SYNC (1005h = 0x81)"),
+        (0x20000080, "node 5 takes another frame as SYNC (1005h = 0x20000080)"),
+    ],
+)
+def test_a_node_that_does_not_take_our_sync(configs: Path, channel: str, cob_id: int, said: str) -> None:
+    """One that makes SYNC would begin to with the period; a bit that means nothing is no matter."""
+    with stranger(channel) as node:
+        node.sdo[0x1005].raw, node.sdo[0x6061].raw = cob_id, 10
+        assert said in refused_untouched(configs, channel, "canopen.sync_period=true")
+        with pytest.raises(NodeError, match="set its 1005h to 0x80: the controller sends SYNC"):
+            compare(job(configs, channel))
+        node.sdo[0x1005].raw = 0x80000080
+        assert set_up(configs, channel, "canopen.sync_period=true").written
 
 
 def test_comparing_changes_nothing(configs: Path, channel: str) -> None:
@@ -246,12 +302,12 @@ def test_what_is_refused_before_anything_is_changed(
         assert said in refused_untouched(configs, channel, *settings)
 
 
-@pytest.mark.parametrize("index", [0x6071, 0x606C, 0x60C2, 0x6060, 0x6061, 0x1017, 0x1800])
+@pytest.mark.parametrize("index", [0x6071, 0x606C, 0x60C2, 0x6060, 0x6061, 0x1017, 0x1800, 0x1006])
 def test_an_eds_without_the_object(configs: Path, channel: str, index: int) -> None:
     path = configs / "drives" / "cia402.eds"
     text = path.read_text(encoding="utf-8").replace(f"[{index:04X}", f"[Was{index:04X}")
     path.write_text(text, encoding="utf-8")
-    said = refused_untouched(configs, channel)  # there is no drive: it is refused by the file alone
+    said = refused_untouched(configs, channel, "canopen.sync_period=true")  # by the file: there is no drive
     assert f"has no object {index:04X}h" in said and "cia402.eds" in said
 
 
