@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from firmware_model.config import Record
 from firmware_model.drive import advance, on_command, on_load_command, on_sync
-from firmware_model.jit import COMPILED, array_at, entry, jit, places_of
+from firmware_model.jit import array_at, entry, jit, places_of
 from firmware_model.plant import PARAMS, SAMPLE, STATE
 
 ARRAYS: Final = {"params": PARAMS, "state": STATE, "sample": SAMPLE}
@@ -35,11 +35,6 @@ class Kernels:
         self.params: Any = params[0]
         self.state: Any = state[0]
         self.sample: Any = sample[0]
-        if not COMPILED:
-            self.advance = partial(advance, params[0], self.state)
-            self.sync = partial(on_sync, params[0], self.state, self.sample)
-            self.command, self.load = partial(on_command, self.state), partial(on_load_command, self.state)
-            return
         copies = {"params": params, "state": state.copy(), "sample": sample.copy()}
         trial, places = places_of(copies, ARRAYS), places_of(self._alive, ARRAYS)
         self.advance = partial(entry(advance_at, trial, 0), places)

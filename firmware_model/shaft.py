@@ -15,7 +15,7 @@ from typing import Any
 from firmware_model.config import PlantConfig, Record
 from firmware_model.current import regulate
 from firmware_model.drive import heat, protect, watch
-from firmware_model.jit import COMPILED, array_at, entry, jit, places_of
+from firmware_model.jit import array_at, entry, jit, places_of
 from firmware_model.load import edge_after, held_load, varying_load
 from firmware_model.motor import constants, held, slopes
 from firmware_model.plant import ANGLE, PARAMS, STATE, State
@@ -52,12 +52,9 @@ class Shaft:
 
     def __init__(self, p: Record, s: Record, q: Record, r: Record) -> None:
         self._alive = {"p": p, "s": s, "q": q, "r": r}
-        if COMPILED:
-            trial = self._alive | {"s": s.copy(), "r": r.copy()}
-            places = places_of(self._alive, _ARRAYS)
-            self.advance: Any = partial(entry(advance_at, places_of(trial, _ARRAYS), 0), places)
-        else:
-            self.advance = partial(advance_both, p[0], s[0], q[0], r[0])
+        trial = self._alive | {"s": s.copy(), "r": r.copy()}
+        places = places_of(self._alive, _ARRAYS)
+        self.advance: Any = partial(entry(advance_at, places_of(trial, _ARRAYS), 0), places)
 
 
 @jit

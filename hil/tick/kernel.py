@@ -112,6 +112,7 @@ def estimate_speed(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
 def estimate_angle(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     """The angle over turns and its following error; until operation its reference begins where the shaft is.
 
+    The shaft has turned on since the last measurement: by the speed that the observer foretells.
     What is no angle is left to the guard, and so is what it jumps by, which ``slip`` forgets within SLIP_S.
     """
     ls["unseen"] += t["gap"]
@@ -121,7 +122,7 @@ def estimate_angle(p: Any, s: Any, lp: Any, ls: Any, t: Any) -> None:
     if s["reason"] == 0 and s["state"] != DriveState.OPERATION_ENABLED:
         ls["origin"] = ls["turned"] - t["theta_ref"]
     ls["theta_ref"] = t["theta_ref"]
-    t["theta_turned"] = ls["turned"] - ls["origin"]
+    t["theta_turned"] = ls["turned"] - ls["origin"] + ls["unseen"] * p["T_s"] * ls["x"][0]
     t["theta_error"] = t["theta_ref"] - t["theta_turned"]
 
 

@@ -20,7 +20,7 @@ from hil.report.collect import collect
 from hil.report.criteria import figures
 from hil.report.metrics import operating
 from hil.runtime.setup import Overrides, Setup, load_setup
-from hil.signals import INPUTS, DriveState, Reason, Request, TickArray
+from hil.signals import INPUTS, DriveState, Reason, Request, RxFlag, TickArray
 from hil.sim.simulate import simulate, simulate_ticks
 from tests.conftest import CONFIGS
 
@@ -86,6 +86,21 @@ def _inputs(ticks: TickArray, row: int) -> TickArray:
         if not name.startswith("_") and name not in INPUTS:
             now[name] = 0
     return now
+
+
+def test_what_a_lost_measurement_leaves_out_is_no_following_error(ticks: TickArray) -> None:
+    """At 80 rad/s the shaft goes 80 mrad in a tick; it is known to have."""
+    machine, lost = setup_of().machine.fresh(), range(700, 703)
+    for row in range(710):
+        now = _inputs(ticks, row)
+        if row in lost:
+            now["rx_flags"] ^= int(RxFlag.FRESH)
+            now["theta"], now["w"] = ticks["theta"][699], ticks["w"][699]
+        machine.step(now)
+        if row in lost:
+            assert abs(now["theta_error"][0]) < 5e-3
+            assert now["theta_turned"][0] == pytest.approx(ticks["theta_turned"][row], abs=2e-3)
+    assert ticks["theta_turned"][702] - ticks["theta_turned"][699] > 0.2
 
 
 def ended(ticks: TickArray, change: Callable[[Any, int], None], *settings: str) -> tuple[Reason, int]:
