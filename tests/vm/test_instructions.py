@@ -89,5 +89,5 @@ def test_each_node_of_those_that_are_counted_answers_in_time(
 
 
 def test_two_nodes_cost_less_than_half_more_than_one(counted: dict[str, Any]) -> None:
-    """Of the same drive in the same boot: 1.46 x."""
+    """Of the same drive in the same boot: 1.47 x."""
     assert total_of(of_bus(counted, "nodes")) < 1.5 * total_of(of_bus(counted, "node"))
