@@ -1,7 +1,8 @@
 """The reference of a tick: the config's profile, a live set-point instead of it, and the ramp before a stop.
 
 All three end in ``w_ref``, ``dw_ref`` and ``i_q_ref_in``, which are inputs of the tick and logged, so that a
-replay needs none of this. Time counts in periods (``gap``), so that skipped ones do not stretch a ramp.
+replay needs none of this. Time counts in periods (``gap``), so that skipped ones stretch neither profile nor
+ramp.
 """
 
 from __future__ import annotations
@@ -52,12 +53,13 @@ SETPOINT_STATE: Final = np.dtype(
         ("theta", "f8"),
         ("theta_base", "f8"),
         ("own", "i8"),
+        ("skipped", "i8"),
     ],
     align=True,
 )
 """Newest references; live targets and whether there are any; of the ramp: ticks since its begin and since the
 reference is 0, and the references that it began with; the reference angle, what it is ahead of the profile's
-own, and whether the profile gave it."""
+own, and whether the profile gave it; periods skipped in operation."""
 
 Record = npt.NDArray[np.void]
 
@@ -130,7 +132,11 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
     gs``: parameters and state of this module; ``ss, lp``: the supervisor's state, the law's parameters.
     """
     t, s, p, g = ticks[0], ss[0], gp[0], gs[0]
-    time = s["run_ticks"] * lp[0]["T_s"]
+    if s["run_ticks"] == 0:
+        g["skipped"] = 0
+    elif s["state"] == DriveState.OPERATION_ENABLED:
+        g["skipped"] += t["gap"] - 1
+    time = (s["run_ticks"] + g["skipped"]) * lp[0]["T_s"]
     w_ref, dw_ref = reference_at(rp[0], time)
     pair = lp[0]["pair"]
     i_q = rp[0]["i_q"] if lp[0]["kind"] == FAC or pair == LEADS else 0.0

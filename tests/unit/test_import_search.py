@@ -215,7 +215,8 @@ TIMES = {"k", "t_ns", "lateness_ns", "received_ns", "computed_ns", "sent_ns", "r
 def assert_same(world: World, frames: Iterable[Heard], name: str, *unseen: str) -> Run:
     """Import finds each tick of the world's run again, in all but its times and where k begins.
 
-    ``unseen``: fields that may differ where no command depends on them; k is right at each measurement.
+    ``unseen``: fields that may differ where no command depends on them; k and reference are right at each
+    measurement.
     """
     run, ticks = found(frames, setup_of(name))
     back, true = np.concatenate(list(ticks)), np.concatenate(world.ticks)
@@ -227,6 +228,7 @@ def assert_same(world: World, frames: Iterable[Heard], name: str, *unseen: str) 
     assert differ <= set(unseen), (differ, [(i, true["gap"][i], back["gap"][i]) for i in other])
     measured = operating & (true["rx_flags"] & RxFlag.FRESH > 0)
     assert len(np.unique(true["k"][measured].astype(int) - back["k"][measured].astype(int))) == 1
+    assert all((true[name][measured] == back[name][measured]).all() for name in ("w_ref", "dw_ref"))
     return run
 
 
@@ -250,7 +252,7 @@ def test_hold_ups_anywhere_come_back_from_the_controllers_own_recording(name: st
     world = ran(name, hold, 500, seed)
     true = np.concatenate(world.ticks)
     assert true["skipped"].sum() > 20 and (true["rx_flags"] & RxFlag.FRESH == 0).sum() > 5, f"seed {seed}"
-    assert_same(world, world.own, name, "gap", "skipped")
+    assert_same(world, world.own, name, "gap", "skipped", "w_ref", "dw_ref")
 
 
 def commands(frames: list[Heard], setup: Setup) -> list[int]:

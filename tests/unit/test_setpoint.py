@@ -265,6 +265,23 @@ def test_the_profile_runs_with_the_time_in_operation() -> None:
     assert 0.0 < w < 80.0 and dw > 0.0
 
 
+def test_skipped_periods_do_not_stretch_the_profile() -> None:
+    """Periods in operation count, with a tick or without; those before and after do not."""
+    bench = Bench()
+    of = bench.machine.reference[0]
+    bench.tick(Request.ARM, 0.0, gap=9, run_ticks=0)
+    for run_ticks, gap, periods in ((100, 1, 100), (101, 3, 103), (102, 1, 104), (103, 2, 106)):
+        assert (
+            bench.tick(Request.ARM, 0.0, gap=gap, run_ticks=run_ticks)[0]
+            == reference_at(of, periods * 1e-3)[0]
+        )
+    bench.machine.safety_state["state"] = DriveState.FAULT
+    bench.tick(Request.ARM, 0.0, gap=2, run_ticks=104)
+    assert bench.machine.setpoint_state[0]["skipped"] == 3
+    bench.tick(Request.ARM, 0.0, gap=2, run_ticks=0)
+    assert bench.machine.setpoint_state[0]["skipped"] == 0
+
+
 def test_a_ramp_of_one_tick_is_one() -> None:
     bench = Bench()
     bench.machine.setpoint["stop_ticks"] = 1
