@@ -131,15 +131,15 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
     A stop that is asked for in operation becomes RAMP_DOWN until the ramp is over. ``rp``: the profile; ``gp,
     gs``: parameters and state of this module; ``ss, lp``: the supervisor's state, the law's parameters.
     """
-    t, s, p, g = ticks[0], ss[0], gp[0], gs[0]
+    t, s, p, g, profile, law = ticks[0], ss[0], gp[0], gs[0], rp[0], lp[0]
     if s["run_ticks"] == 0:
         g["skipped"] = 0
     elif s["state"] == DriveState.OPERATION_ENABLED:
         g["skipped"] += t["gap"] - 1
-    time = (s["run_ticks"] + g["skipped"]) * lp[0]["T_s"]
-    w_ref, dw_ref = reference_at(rp[0], time)
-    pair = lp[0]["pair"]
-    i_q = rp[0]["i_q"] if lp[0]["kind"] == FAC or pair == LEADS else 0.0
+    time = (s["run_ticks"] + g["skipped"]) * law["T_s"]
+    w_ref, dw_ref = reference_at(profile, time)
+    pair = law["pair"]
+    i_q = profile["i_q"] if law["kind"] == FAC or pair == LEADS else 0.0
     w_ref, dw_ref, i_q = follow(p, g, w_ref, dw_ref, i_q, t["gap"])
     orderly = t["request"] == Request.STOP and s["state"] == DriveState.OPERATION_ENABLED
     if g["ramping"]:
@@ -151,8 +151,8 @@ def prepare(rp: Any, gp: Any, gs: Any, ss: Any, lp: Any, ticks: Any) -> None:
         over = ramp_over(p, g, w_ref, t["w"], t["gap"])
         if orderly and not over:
             t["request"] = Request.RAMP_DOWN.value
-    if lp[0]["k_th"] != 0.0:
-        t["theta_ref"] = turned(rp[0], p, g, time, w_ref, t["gap"])
+    if law["k_th"] != 0.0:
+        t["theta_ref"] = turned(profile, p, g, time, w_ref, t["gap"])
     g["w"], g["i_q"] = w_ref, i_q
     t["w_ref"], t["dw_ref"] = w_ref, dw_ref
     if pair != FOLLOWS:  # else another node's law has written it

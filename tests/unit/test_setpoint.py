@@ -13,7 +13,7 @@ from hil.config.design import Machine
 from hil.config.setpoint_design import acceleration_max, setpoint_params, stop_rate
 from hil.control.errors import ControlDesignError
 from hil.control.law import FAC
-from hil.control.references import reference_at
+from hil.control.references import reference, reference_at, turned_at
 from hil.control.speed import FOLLOWS, LEADS
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import DriveState, Request, new_ticks
@@ -26,6 +26,7 @@ from hil.tick.setpoint import (
     ramp_over,
     ramped,
     stepped,
+    turned,
 )
 from tests.conftest import CONFIGS
 
@@ -270,16 +271,46 @@ def test_skipped_periods_do_not_stretch_the_profile() -> None:
     bench = Bench()
     of = bench.machine.reference[0]
     bench.tick(Request.ARM, 0.0, gap=9, run_ticks=0)
-    for run_ticks, gap, periods in ((100, 1, 100), (101, 3, 103), (102, 1, 104), (103, 2, 106)):
+    for run_ticks, gap, periods in ((700, 1, 700), (701, 3, 703), (702, 1, 704), (703, 2, 706)):
         assert (
             bench.tick(Request.ARM, 0.0, gap=gap, run_ticks=run_ticks)[0]
             == reference_at(of, periods * 1e-3)[0]
         )
     bench.machine.safety_state["state"] = DriveState.FAULT
-    bench.tick(Request.ARM, 0.0, gap=2, run_ticks=104)
+    bench.tick(Request.ARM, 0.0, gap=2, run_ticks=704)
     assert bench.machine.setpoint_state[0]["skipped"] == 3
     bench.tick(Request.ARM, 0.0, gap=2, run_ticks=0)
     assert bench.machine.setpoint_state[0]["skipped"] == 0
+
+
+def test_the_reference_angle_is_the_profiles_own_and_elsewhere_trapezoids() -> None:
+    """By hand, T_s = 0.5 s, a ramp of 4 rad/s2: theta* = 2 t^2 where the profile goes on."""
+    rp, p, g = reference("ramp", w=80.0, rate=4.0)[0], no_setpoint()[0], new_setpoint_state()[0]
+    p["T_s"], g["theta"], g["w"] = 0.5, 10.0, 3.0
+    assert turned(rp, p, g, 1.0, 4.0, 2) == 10.0 + 3.5, "the way there is a trapezoid"
+    assert turned(rp, p, g, 1.5, 99.0, 7) == 13.5 + 2.5, "and then the profile's"
+    g["live_w"], g["w"] = 1, 4.0
+    assert turned(rp, p, g, 2.0, 5.0, 3) == 16.0 + 6.75
+    assert turned(rp, p, g, 2.5, 6.0, 1) == 22.75 + 2.5
+    g["live_w"], g["ramping"] = 0, 1
+    assert turned(rp, p, g, 3.0, 0.0, 1) == 25.25 + 1.0
+    g["ramping"] = 0
+    assert turned(rp, p, g, 3.5, 2.0, 1) == 26.25 + 1.5
+    assert turned(rp, p, g, 4.0, 99.0, 9) == 27.75 + 7.5
+
+
+def test_an_angle_is_given_to_the_law_that_follows_one() -> None:
+    bench = Bench(name="position.toml")
+    of, time = bench.machine.reference[0], 1.5
+    bench.tick(Request.ARM, run_ticks=1499)
+    before = float(bench.t["theta_ref"])
+    w, _, _ = bench.tick(Request.ARM, run_ticks=1500, gap=1)
+    assert float(bench.t["theta_ref"]) - before == pytest.approx(turned_at(of, time) - turned_at(of, 1.499))
+    assert 0.0 < w * 0.9e-3 < float(bench.t["theta_ref"]) - before < w * 1.1e-3
+    other = Bench()
+    other.t["theta_ref"] = 7.0
+    other.tick(Request.ARM)
+    assert other.t["theta_ref"] == 7.0
 
 
 def test_a_ramp_of_one_tick_is_one() -> None:
