@@ -402,3 +402,19 @@ def test_no_number_forgets_the_last_command(where: int) -> None:
     reason = guard_command(guard.p[0], guard.s[0], guard.t, *asked)
     assert reason == Reason.CONTROLLER_ERROR and guard.t["guard_flags"] == GuardFlag.NOT_A_NUMBER
     assert (guard.s["u_q"][0], guard.s["u_d"][0], guard.s["T_L"][0]) == (0.0, 0.0, 0.0)
+
+
+def measured(theta: float, slip: float, theta_jump: float) -> int:
+    guard = Guard(theta_jump=theta_jump)
+    guard.t["v_dc"], guard.t["theta"], guard.s["slip"] = 500.0, theta, slip
+    guard.t["temperature_motor"] = guard.t["temperature_inverter"] = 25.0
+    return int(judge_measurement(guard.p[0], guard.s[0], guard.t))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_angle_is_a_number_and_moves_by_what_the_speed_tells(sign: float) -> None:
+    assert measured(sign * 0.99e9, sign * 0.5, 0.5) == Reason.NONE
+    for theta in (math.nan, sign * math.inf, sign * 1e9):
+        assert measured(theta, 0.0, 0.5) == Reason.NOT_A_NUMBER
+    assert measured(0.0, sign * 0.51, 0.5) == Reason.ANGLE_JUMP
+    assert measured(math.nan, sign * 9.0, 0.0) == Reason.NONE, "of a law without an angle"

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from hil.signals import Controlword, DriveState, Reason, Request, RxFlag
+from hil.tick.guard import FOLLOWING_ANGLE
 from hil.tick.supervisor import (
     STOP_TICKS,
     arming,
@@ -203,6 +204,26 @@ def test_echoes_are_judged_when_fresh_and_not_in_a_shadow_run() -> None:
     guard.t["rx_flags"] = 0
     guard.p["shadow"] = 0
     assert [echo(guard, 5, 1) for _ in range(4)] == [(0, 0)] * 4
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_angle_may_be_so_far_from_its_reference(sign: float) -> None:
+    guard = bench(theta_jump=0.5, theta_error_max=1.0, w_error_max=5.0, w_error_ticks=2)
+    guard.t["theta_error"], guard.t["w"] = sign, 5.0
+    assert [ask(judge_following, guard) for _ in range(4)] == [0] * 4
+    guard.t["theta_error"] = 1.1 * sign
+    assert [ask(judge_following, guard) for _ in range(2)] == [0, Reason.ANGLE_ERROR]
+    assert guard.s["over"][0, FOLLOWING_ANGLE] == 2 and guard.s["over"].sum() == 2
+    guard.t["w"] = 5.1
+    assert [ask(judge_following, guard) for _ in range(2)] == [Reason.ANGLE_ERROR] * 2
+    guard.t["theta_error"] = 0.0
+    assert ask(judge_following, guard) == Reason.FOLLOWING_ERROR
+
+
+def test_a_law_without_an_angle_is_judged_by_none() -> None:
+    guard = bench(theta_error_max=1.0, w_error_ticks=1)
+    guard.t["theta_error"] = 9.0
+    assert ask(judge_following, guard) == Reason.NONE
 
 
 @pytest.mark.parametrize("w", [10.0, -10.0])
