@@ -73,8 +73,8 @@ docs: $(STAMP) ## the documentation as a site in .cache/site, links checked
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo ".cache/site/index.html"
 
-golden: $(STAMP) ## run the golden scenarios: what changed against the kept logs (KEEP=name, SIGN="reason")
-	$(BIN)/python -m tests.golden.rewrite $(if $(KEEP),--keep '$(KEEP)') $(if $(SIGN),--sign '$(SIGN)')
+golden: $(STAMP) ## run the golden scenarios: what changed against the kept logs (KEEP=name, SIGN="reason", ONLY=scenario)
+	$(BIN)/python -m tests.golden.rewrite $(if $(KEEP),--keep '$(KEEP)') $(if $(SIGN),--sign '$(SIGN)') $(ONLY)
 
 faults: $(STAMP) ## the fault matrix, every row as expected
 	$(BIN)/hil faults configs/faults.toml

@@ -1,7 +1,8 @@
 """`make golden`: run the golden scenarios with today's code and say what changed against the kept logs.
 
 The kept logs stay as they are. With ``--keep NAME`` today's are kept beside them as another generation; with
-``--sign REASON`` what a kept log replays as today is signed. Both rewrite the checksums.
+``--sign REASON`` what a kept log replays as today is signed. Both rewrite the checksums. Where scenarios are
+named, these alone are run.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ from tests.conftest import CONFIGS
 from tests.golden import kept
 
 RAMP = ["--set", 'reference={kind="ramp", w_rad_s=60.0, rate_rad_s2=300.0, at_s=0.05}']
+MOVE = [
+    "--set",
+    'reference={kind="move",target_turns=2.0,w_rad_s=30.0,rate_rad_s2=200.0,jerk_rad_s3=4000.0,at_s=0.1}',
+]
 DROP = '[{kind="drop",at_s=0.2,for_s=0.1,share=0.1,seed=11},{kind="drop",at_s=0.4}]'
 SIMULATED = {
     "simulate": ("demo.toml", 0.8, RAMP),
@@ -39,8 +44,13 @@ BUS: dict[str, tuple[str, float, list[str], list[str]]] = {
         ["--lockstep", *RAMP, "--set", "feedback.hold_ticks=5"],
     ),
     "inverter": ("inverter.toml", 0.8, [], []),
+    "own-loop": ("current.toml", 0.8, ["--lockstep"], ["--lockstep", *RAMP]),
+    "position": ("position.toml", 1.5, ["--lockstep"], ["--lockstep", *MOVE]),
+    "two-nodes": ("dyno-fac.toml", 0.8, ["--lockstep"], ["--lockstep"]),
 }
 """Config, seconds, words for the emulator, words for the run; the inverter alone runs in real time."""
+CANOPEN = {"position": ([],), "two-nodes": (["--set", "node=motor"], ["--set", "node=load"])}
+"""What `hil configure` is called with before a run, once for each drive."""
 HIL = (sys.executable, "-m", "hil.cli")
 
 
@@ -69,10 +79,18 @@ def on_the_bus(folder: Path, name: str) -> None:
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as drive:
         assert drive.stdout is not None
         drive.stdout.readline()
-        words = ["run", str(CONFIGS / config), "-c", channel, "--duration", str(seconds), *more]
-        quiet = ["--set", "realtime.lock_memory=false", "--set", "drive.heartbeat_timeout_s=20.0"]
-        subprocess.run([*HIL, *words, *quiet, *names(folder, name)], check=False, stdout=subprocess.DEVNULL)
-        drive.send_signal(signal.SIGINT)
+        try:
+            for settings in CANOPEN.get(name, ()):
+                words = ["configure", str(CONFIGS / config), "-c", channel, "--json", *settings]
+                subprocess.run([*HIL, *words], check=True, stdout=subprocess.DEVNULL)
+            words = ["run", str(CONFIGS / config), "-c", channel, "--duration", str(seconds), *more]
+            quiet = ["--set", "realtime.lock_memory=false"]
+            if name != "two-nodes":  # in lockstep a heartbeat goes by another clock
+                quiet += ["--set", "drive.heartbeat_timeout_s=20.0"]
+            words += [*quiet, *names(folder, name)]
+            subprocess.run([*HIL, *words], check=False, stdout=subprocess.DEVNULL)
+        finally:
+            drive.send_signal(signal.SIGINT)
 
 
 def changed(old: Path, new: Path) -> str:
@@ -116,15 +134,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keep", metavar="NAME", help="keep today's logs as generation NAME")
     parser.add_argument("--sign", metavar="REASON", help="sign what kept logs replay as today")
+    parser.add_argument("scenario", nargs="*", help="these alone (default: all)")
     args = parser.parse_args()
+    chosen = args.scenario or [*SIMULATED, *BUS]
+    if unknown := set(chosen) - {*SIMULATED, *BUS}:
+        parser.error(f"no scenario {', '.join(sorted(unknown))}; there are {', '.join([*SIMULATED, *BUS])}")
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        for name in SIMULATED:
-            simulate(folder, name)
-        for name in BUS:
-            on_the_bus(folder, name)
+        for name in chosen:
+            (simulate if name in SIMULATED else on_the_bus)(folder, name)
         for paths in kept.runs().values():
             for path in paths:
+                if path.name.split(".")[0] not in chosen:
+                    continue
                 new = folder / path.name
                 what = changed(path, new) if new.is_file() else "is not written any more"
                 what = "in real time, not compared" if path.stem == "inverter" and new.is_file() else what
