@@ -90,7 +90,8 @@ def _hottest(p: Any, s: Any, t: Any) -> float:
 
 
 def _no_numbers(p: Any, s: Any, t: Any) -> str:
-    names = [n for n in _MEASURED if not math.isfinite(t[n])]
+    judged = _MEASURED + (("theta",) if p["theta_jump"] > 0.0 else ())  # others follow no angle
+    names = [n for n in judged if not math.isfinite(t[n])]
     return ", ".join(f"{name} is {float(t[name])}" for name in names)
 
 
@@ -126,7 +127,7 @@ def _drive(p: Any, s: Any, t: Any) -> str:
 
 
 _TEMPERATURES: Final = ("temperature_motor", "temperature_inverter")
-_MEASURED: Final = ("w", "i_q", "i_d", "theta", "v_dc", *_TEMPERATURES)
+_MEASURED: Final = ("w", "i_q", "i_d", "v_dc", *_TEMPERATURES)
 
 CAUSES: Final[dict[Reason, Cause]] = {
     Reason.STOP_REQUESTED: Cause(

@@ -101,6 +101,9 @@ def test_what_is_no_number_is_named() -> None:
     ticks["temperature_inverter"] = math.inf
     end = explain(guard.p, guard.s, ticks[0])
     assert end is not None and end.detail == "v_dc is nan, temperature_inverter is inf"
+    guard.p["theta_jump"], ticks["theta"] = 0.5, math.nan
+    followed = explain(guard.p, guard.s, ticks[0])
+    assert followed is not None and followed.detail.endswith("is inf, theta is nan")
 
 
 def test_the_command_line_says_why(configs: Path) -> None:
