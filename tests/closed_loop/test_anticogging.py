@@ -92,6 +92,7 @@ def test_the_ripple_of_a_slow_speed_drops_tenfold() -> None:
     assert np.abs(own["T_L_true"] - np.mean(own["T_L_true"])).max() > 0.4
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     "law",
     [
@@ -160,6 +161,7 @@ def test_zeros_are_nothing_to_the_bit_and_an_angle_alone_changes_nothing() -> No
         assert np.array_equal(plain[name], deaf[name], equal_nan=True), name
 
 
+@pytest.mark.long
 def test_a_drive_with_its_own_loop_and_a_filtered_speed_is_taught_too(tmp_path: Path) -> None:
     shutil.copytree(CONFIGS, tmp_path, dirs_exist_ok=True)
     path, plant = (

@@ -76,6 +76,7 @@ def test_a_load_that_acts_all_the_time_is_a_parameter() -> None:
     assert any("acts on the shaft all the time" in line for line in session.estimate.findings)
 
 
+@pytest.mark.long
 def test_a_supply_that_limits_is_ridden_through_with_wider_intervals() -> None:
     """60 V of 540 V: most ticks are limited and left out; the rest tells the motor, and B_f is refused."""
     session = seen("demo", ("standstill", "inertia"), NO_LOAD, LOW, own=FEW_VOLTS)

@@ -48,6 +48,7 @@ def runs_of(tmp_path: Path, name: str, steps: tuple[str, ...]) -> tuple[RunConfi
     return config, runs
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("name", CASES)
 def test_shaft_lag_and_delay_are_found_within_the_limits(tmp_path: Path, name: str) -> None:
     config, runs = runs_of(tmp_path, name, ("standstill", "inertia"))

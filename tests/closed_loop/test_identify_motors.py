@@ -21,7 +21,7 @@ pytestmark = [pytest.mark.compiled, pytest.mark.slow]
 GOALS = {"R_s": 0.02, "L_d": 0.02, "L_q": 0.02, "psi_f": 0.02, "J": 0.03, "coulomb": 0.1}
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("name", MOTORS)
 def test_a_motor_that_nobody_told(tmp_path: Path, name: str) -> None:
     true = dict(zip(NAMES, MOTORS[name], strict=True))

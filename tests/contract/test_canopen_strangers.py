@@ -58,6 +58,7 @@ def tick(bus: can.BusABC, say: Callable[[int, bytes], None], word: int, torque: 
     raise AssertionError("no answer to SYNC")
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     ("settings", "said"),
     [

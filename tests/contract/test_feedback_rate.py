@@ -74,6 +74,7 @@ def see_it_holds(ticks: Any, every: int, known: int) -> None:
     assert (np.diff(asked_for) != 0.0).mean() > 0.5, "the law goes on between two measurements"
 
 
+@pytest.mark.long
 def test_an_odrive_at_200_hz_holds_the_load_and_replays_to_the_bit(tmp_path: Path) -> None:
     overrides = asked(folder=tmp_path)
     ticks, log = in_lockstep(ODRIVE, overrides, ("feedback_every=5", *EXACT))

@@ -79,6 +79,7 @@ def said(words: list[str], capsys: Any) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("last", [False, True], ids=["first", "last"])
 @pytest.mark.parametrize("variant", list(VARIANTS))
 def test_a_rewritten_log_is_read_whole(variant: str, last: bool, tmp_path: Path, capsys: Any) -> None:

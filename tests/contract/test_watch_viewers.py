@@ -87,6 +87,7 @@ async def flooded(one: Web) -> tuple[list[int], int, list[int]]:
     return got, waiting, missed
 
 
+@pytest.mark.long
 def test_viewers_that_never_read_cost_a_message_each(monkeypatch: pytest.MonkeyPatch) -> None:
     got, waiting, missed = asyncio.run(flooded(server(monkeypatch)))
     assert got[-1] == MESSAGES and all(a < b for a, b in pairwise(got))

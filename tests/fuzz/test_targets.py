@@ -42,6 +42,7 @@ def test_seeded_inputs_are_taken_or_refused(every: dict[str, Target], name: str)
     assert fuzz(name, every[name], seed=1, seconds=120.0, most=most) > 0
 
 
+@pytest.mark.long
 def test_deliberate_breaks_of_guard_and_client_are_noticed() -> None:
     command = [sys.executable, "-m", "tests.fuzz.breaks"]
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(ROOT)}

@@ -101,6 +101,7 @@ def test_a_bus_of_one_process_is_nobody_elses() -> None:
         pass
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize(
     "words", [["--lockstep"], ["--set", 'loop.clock="lockstep"'], ["--lockstep", "--shadow"]]
 )
@@ -111,6 +112,7 @@ def test_lockstep_on_a_real_bus_is_refused(configs: Path, settings: Settings, wo
     assert "keeps its own time: nothing was sent" in done.stderr
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("stdin", ["</dev/null", "<&-", "<<<yes"])
 def test_without_a_terminal_arm_alone_is_refused(configs: Path, settings: Settings, stdin: str) -> None:
     words = ["run", str(configs / "can0.toml"), *flags(settings()), "-c", "nonecan9", "--arm"]

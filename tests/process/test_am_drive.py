@@ -59,6 +59,7 @@ def ran(path: Path, own: tuple[str, ...]) -> tuple[int, dict[str, Any], Any]:
     return done.returncode, result, ticks[ticks["state"] == DriveState.OPERATION_ENABLED]
 
 
+@pytest.mark.long
 def test_the_loop_holds_a_strangers_motor(path: Path, settings: Settings, channel: str) -> None:
     """Their dry friction is the first load, a step of 4 N m the second: each within 2 % of the step."""
     with am_drive(channel):

@@ -52,6 +52,7 @@ def test_a_bus_that_may_have_a_real_drive_is_refused() -> None:
     assert "can0: a bench runs the emulated drive" in done.stderr
 
 
+@pytest.mark.long
 def test_a_file_to_compare_with_is_read_before_anything_is_measured(tmp_path: Path) -> None:
     done = bench("--quick", "--compare", str(tmp_path / "none.json"))
     assert done.returncode == 2

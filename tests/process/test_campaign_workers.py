@@ -76,7 +76,7 @@ def until(what: str, seconds: float = 240.0) -> Iterator[None]:
     pytest.fail(f"never: {what}")
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("victim", ["worker", "source"])
 def test_rows_do_not_depend_on_workers_batches_and_losses(tmp_path: Path, victim: str) -> None:
     """What is killed: a worker, or what workers are forked off."""

@@ -169,6 +169,7 @@ def address(column: str) -> IPv4Address:
     return IPv4Address(int.from_bytes(bytes.fromhex(column.partition(":")[0]), sys.byteorder))
 
 
+@pytest.mark.long
 def test_sockets_are_of_this_machine_alone(bench: Bench) -> None:
     until(bench.start("watch", "--web", "--port", "0"), "http://")
     web = bench.processes.pop("watch")

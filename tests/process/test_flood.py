@@ -161,7 +161,7 @@ def named(value: object) -> str:
     return "+".join(kind.__name__ for kind in value) if isinstance(value, tuple) else ""
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("bursts", [True, False], ids=["bursts", "full-speed"])
 def test_frames_of_nobody_are_ridden_through(begin: Callable[[], Bench], bursts: bool) -> None:
     """2500 frames a second are nothing; more than the sockets hold may end in a stop for what was lost."""
@@ -218,6 +218,7 @@ def test_a_bus_that_is_flooded_from_the_beginning_never_sees_a_voltage(begin: Ca
     bench.assert_drive_is_at_rest()
 
 
+@pytest.mark.long
 def test_a_flood_of_answers_from_the_beginning_is_found_out_in_the_soft_start(
     begin: Callable[[], Bench],
 ) -> None:

@@ -90,7 +90,7 @@ SWAPPED = '[[fault]]\nkind = "phase-swap"\nat_s = 0.0\n'
 SLIP = '[[fault]]\nkind = "encoder-slip"\nangle_deg = 180.0\nat_s = 0.0\n'
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("steps", "more", "settings", "words"),
     [

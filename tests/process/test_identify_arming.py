@@ -44,6 +44,7 @@ def test_a_real_bus_asks_with_the_limits_and_takes_the_answer(
         assert "can't open bus" not in shown and "step sensors" not in shown
 
 
+@pytest.mark.long
 def test_without_arm_or_a_terminal_nothing_is_opened(configs: Path, settings: Settings) -> None:
     for words, said in (((), "arm with --arm"), (("--yes",), "arm with --arm"), (("--arm",), "terminal")):
         done = call(*on_a_real_bus(configs, settings), *words)

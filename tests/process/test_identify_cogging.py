@@ -35,6 +35,7 @@ def told(capsys: pytest.CaptureFixture[str], *args: str) -> dict[str, Any]:
     return result
 
 
+@pytest.mark.long
 def test_a_motor_is_taught_over_the_bus_and_from_its_log(
     configs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -78,6 +78,7 @@ def there_and_back(one: Ran, folder: Path, ending: str) -> Path:
     return back
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
 def test_there_and_back_is_the_same_in_every_field(steady: Ran, tmp_path: Path, ending: str) -> None:
     back = there_and_back(steady, tmp_path, ending)
@@ -91,6 +92,7 @@ def two_inputs(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     return ran(tmp_path_factory.mktemp("fac"), "paper.toml", "import-fac", "loop.duration_s=1.0")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
 def test_fac_on_can_fd_there_and_back(two_inputs: Ran, tmp_path: Path, ending: str) -> None:
     back = there_and_back(two_inputs, tmp_path, ending)
@@ -144,6 +146,7 @@ def other_protocol(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     return ran(tmp_path_factory.mktemp("inverter"), "inverter.toml", "import-other", "loop.duration_s=1.0")
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("ending", [".log", ".blf", ".asc", ".mf4"])
 def test_another_protocol_through_every_format_into_replay_and_report(
     other_protocol: Ran, tmp_path: Path, ending: str, capsys: Any

@@ -50,6 +50,7 @@ def nodes_of(result: dict[str, Any]) -> tuple[Log, Log]:
     return open_log(path), open_log(path, node="load")
 
 
+@pytest.mark.long
 def test_the_bench_runs_and_replays(configs: Path, settings: Settings) -> None:
     """The motor holds its speed against the load machine's 5.4 N m, and both controllers replay."""
     code, result = demo(configs, settings(*LOCKSTEP))
@@ -166,6 +167,7 @@ def test_the_second_node_s_reference_is_set_while_it_runs(
     }  # fmt: skip
 
 
+@pytest.mark.long
 def test_the_guardian_stops_both(configs: Path, settings: Settings, channel: str) -> None:
     """SIGKILL of the controller: without anybody's help both drives are commanded no torque and left."""
     path = configs / "dyno.toml"

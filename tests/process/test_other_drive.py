@@ -46,6 +46,7 @@ def patient(configs: Path) -> Path:
     return configs / NAME
 
 
+@pytest.mark.long
 def test_it_settles_and_replays_to_the_bit(patient: Path, settings: Settings) -> None:
     own = settings("loop.duration_s=4.0", "reference.at_s=0.1")
     done = call("demo", str(patient), "--json", *flags(own))

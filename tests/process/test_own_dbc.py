@@ -43,6 +43,7 @@ def test_a_run_goes_on_where_the_counter_wraps(configs: Path, settings: Settings
     assert counters.max() == last and abs(ticks["u_q"]).max() > 1.0
 
 
+@pytest.mark.long
 def test_feedback_of_another_length_is_named_before_arming(
     configs: Path, settings: Settings, channel: str
 ) -> None:
@@ -89,6 +90,7 @@ def test_feedback_of_another_length_ends_a_run_with_both_lengths(configs: Path, 
     assert ("length", "STATUS: length 8, DBC 7") in [(e["kind"], e["text"]) for e in open_log(path).events]
 
 
+@pytest.mark.long
 def test_an_emulator_that_speaks_another_protocol_is_refused(configs: Path, settings: Settings) -> None:
     edit(configs / "inverter.toml", 'plant = "plants/inverter.toml"', 'plant = "plants/demo.toml"')
     for command in ("emulate", "demo"):

@@ -312,6 +312,7 @@ def test_an_emulated_drive_loads_no_exports_either(tmp_path: Path) -> None:
     assert not {"asammdf", "coverage", "matplotlib", "pandas"} & set(modules)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["demo.toml", "cia402.toml"])
 def test_a_simulation_loads_what_reads_mf4_no_more_than_a_run(configs: Path, name: str) -> None:
     """Nor does any command that a bus or its DBC is read for: python-can is imported in one way."""

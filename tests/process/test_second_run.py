@@ -17,7 +17,7 @@ from tests.process.test_run import Settings
 pytestmark = pytest.mark.process
 
 
-@pytest.mark.corners
+@pytest.mark.long
 @pytest.mark.parametrize("stop", ["stop.ramp_rad_s2=0.0", "stop.ramp_max_s=5.0"])
 def test_a_second_run_finds_the_drive_at_rest(configs: Path, settings: Settings, stop: str) -> None:
     """The first is cut while the load is on, with and without a ramp; then nobody commands the drive."""

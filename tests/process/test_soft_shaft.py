@@ -49,6 +49,7 @@ def test_the_demo_on_a_soft_shaft_is_the_simulated_run_and_replays(
     assert not np.array_equal(bus["w"][:4000], rigid["w"][:4000])
 
 
+@pytest.mark.long
 def test_a_design_on_a_soft_shaft_is_foretold_and_the_bus_has_the_same_bits(tmp_path: Path) -> None:
     """The plant of the file and the motor that is believed in; corners differ from them by a setting."""
     own = Overrides(settings=("loop.duration_s=4.0", f'log.folder="{tmp_path}"'))

@@ -212,6 +212,7 @@ def test_lost_ticks_leave_the_next_part_without_a_state(
     assert replay(second).verdict == "cannot" and "ticks were lost before this part" in replay(second).why
 
 
+@pytest.mark.long
 def test_a_run_on_the_bus_in_parts(configs: Path, settings: Settings, tmp_path: Path) -> None:
     """The same ticks and frames as the run in one file, the writer splitting beside the loop."""
     logs = []

@@ -123,6 +123,7 @@ def test_a_wish_that_nobody_knows_is_refused() -> None:
         hil.compare(DEMO, ["pi"], noise=3.0)
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("path", [p for p in EXAMPLES if p.stem != "own_law"], ids=lambda p: p.stem)
 def test_an_example_runs(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

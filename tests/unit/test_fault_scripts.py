@@ -226,6 +226,7 @@ def plant(*given: dict[str, Any], w: float = 50.0) -> tuple[Any, Any, PlantFault
     return state[0], new_sample()[0], PlantFaults(config.fault, params, 15)
 
 
+@pytest.mark.long
 def test_an_open_phase_carries_no_current() -> None:
     s, _, own = plant({"kind": "phase-loss", "at_s": 0.0})
     s["u_q"], s["u_d"] = 130.0, 5.0

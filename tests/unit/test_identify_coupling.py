@@ -131,6 +131,7 @@ def test_a_rigid_fit_of_a_coupling_is_too_sure_and_that_of_two_inertias_is_not()
     assert abs(soft.value[J] - TRUE.J) < soft.half[J]
 
 
+@pytest.mark.corners
 @pytest.mark.slow
 @pytest.mark.parametrize(("hz", "alias"), [(300.0, False), (700.0, True)])
 def test_a_resonance_above_half_the_rate_is_not_taken_for_its_alias(hz: float, alias: bool) -> None:

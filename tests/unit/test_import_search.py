@@ -237,6 +237,7 @@ def at(**points: dict[int, int]) -> Hold:
     return lambda point, n: points.get(point, {}).get(n, 0)
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("name", ["demo.toml", "inverter.toml"])
 @pytest.mark.parametrize("seed", range(6))
 def test_hold_ups_anywhere_come_back_from_the_controllers_own_recording(name: str, seed: int) -> None:

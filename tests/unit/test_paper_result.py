@@ -41,6 +41,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> PaperResult:
     return run(tmp_path_factory.mktemp("paper"), bench())
 
 
+@pytest.mark.long
 def test_verdicts_are_the_golden_ones(result: PaperResult) -> None:
     golden = [tuple(row) for row in json.loads(GOLDEN.read_text(encoding="utf-8"))]
     assert [(i.where, i.item, i.verdict) for i in result.items] == golden

@@ -127,6 +127,7 @@ READS = {
 }
 
 
+@pytest.mark.corners
 @pytest.mark.parametrize("kind", READS)
 def test_a_huge_file_is_refused_without_being_read(kind: str, tmp_path: Path) -> None:
     """A sparse file of 8 GB, in a process that may take 64 MB more than it has."""

@@ -153,6 +153,7 @@ def test_an_adaptive_window_foretells_the_simulation() -> None:
     assert mean_noise(setup, plant, seen, 1e-3) == pytest.approx(said.u_noise, rel=0.07)
 
 
+@pytest.mark.long
 def test_noise_is_foretold_in_every_corner_with_the_axes_coupled() -> None:
     """Without the coupling of the axes it is up to a fifth off."""
     setup = load_setup(DEMO, Overrides(settings=FINE))
@@ -413,6 +414,7 @@ def test_a_window_with_a_lead_is_said_to_be_opt_in(
     assert "observer.speed.kind" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.process
 def test_a_design_is_verified_in_simulation_and_on_the_bus(tmp_path: Path) -> None:
     """Of the 18 plants the two that need no corner; the corners differ from them by a setting."""
