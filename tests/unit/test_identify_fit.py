@@ -28,8 +28,9 @@ COULOMB_TRUE, LOAD_TRUE = 0.2, 0.05
 
 
 def vector(motor: MotorModel, coulomb: float = COULOMB_TRUE, load: float = LOAD_TRUE) -> Array:
+    """The model's vector, of a rigid shaft."""
     m = motor
-    return np.array([m.R_s, m.L_d, m.L_q, m.psi_f, m.J, m.B_f, coulomb, load, 0.0, m.n_p])
+    return np.array([m.R_s, m.L_d, m.L_q, m.psi_f, m.J, m.B_f, coulomb, load, 0.0, m.n_p, 0.0, 0.0, 0.0])
 
 
 def simulated(seed: int, count: int = 1200, noise: tuple[float, float] = (0.02, 0.01)) -> Samples:
