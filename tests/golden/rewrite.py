@@ -28,6 +28,8 @@ MOVE = [
     "--set",
     'reference={kind="move",target_turns=2.0,w_rad_s=30.0,rate_rad_s2=200.0,jerk_rad_s3=4000.0,at_s=0.1}',
 ]
+BEAT = ["--set", "drive.heartbeat_timeout_s=20.0"]
+"""A run in lockstep may be late for a heartbeat, which goes by the wall's clock."""
 DROP = '[{kind="drop",at_s=0.2,for_s=0.1,share=0.1,seed=11},{kind="drop",at_s=0.4}]'
 SIMULATED = {
     "simulate": ("demo.toml", 0.8, RAMP),
@@ -35,17 +37,17 @@ SIMULATED = {
     "split": ("demo.toml", 1.2, ["--set", "log.split_s=1.0"]),
 }
 BUS: dict[str, tuple[str, float, list[str], list[str]]] = {
-    "lockstep": ("demo.toml", 0.8, ["--lockstep"], ["--lockstep", *RAMP]),
-    "lockstep-fac": ("paper.toml", 0.5, ["--lockstep"], ["--lockstep"]),
+    "lockstep": ("demo.toml", 0.8, ["--lockstep"], ["--lockstep", *BEAT, *RAMP]),
+    "lockstep-fac": ("paper.toml", 0.5, ["--lockstep"], ["--lockstep", *BEAT]),
     "fault": (
         "demo.toml",
         1.2,
         ["--lockstep", "--plant-set", f"fault={DROP}"],
-        ["--lockstep", *RAMP, "--set", "feedback.hold_ticks=5"],
+        ["--lockstep", *BEAT, *RAMP, "--set", "feedback.hold_ticks=5"],
     ),
-    "inverter": ("inverter.toml", 0.8, [], []),
-    "own-loop": ("current.toml", 0.8, ["--lockstep"], ["--lockstep", *RAMP]),
-    "position": ("position.toml", 1.5, ["--lockstep"], ["--lockstep", *MOVE]),
+    "inverter": ("inverter.toml", 0.8, [], BEAT),
+    "own-loop": ("current.toml", 0.8, ["--lockstep"], ["--lockstep", *BEAT, *RAMP]),
+    "position": ("position.toml", 1.5, ["--lockstep"], ["--lockstep", *BEAT, *MOVE]),
     "two-nodes": ("dyno-fac.toml", 0.8, ["--lockstep"], ["--lockstep"]),
 }
 """Config, seconds, words for the emulator, words for the run; the inverter alone runs in real time."""
@@ -84,10 +86,7 @@ def on_the_bus(folder: Path, name: str) -> None:
                 words = ["configure", str(CONFIGS / config), "-c", channel, "--json", *settings]
                 subprocess.run([*HIL, *words], check=True, stdout=subprocess.DEVNULL)
             words = ["run", str(CONFIGS / config), "-c", channel, "--duration", str(seconds), *more]
-            quiet = ["--set", "realtime.lock_memory=false"]
-            if name != "two-nodes":  # in lockstep a heartbeat goes by another clock
-                quiet += ["--set", "drive.heartbeat_timeout_s=20.0"]
-            words += [*quiet, *names(folder, name)]
+            words += ["--set", "realtime.lock_memory=false", *names(folder, name)]
             subprocess.run([*HIL, *words], check=False, stdout=subprocess.DEVNULL)
         finally:
             drive.send_signal(signal.SIGINT)
