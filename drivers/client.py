@@ -98,6 +98,11 @@ def precompile(
         (opens or DriveClient)(link, database, load=load, drive_map=drive_map).prepare(tick)
 
 
+def is_before(code: int) -> bool:
+    """Whether a kernel's code is of the frames that came before SYNC."""
+    return code <= BEFORE + HANDED_BACK
+
+
 class DriveClient:
     """A drive on a link. ``now`` stamps frames; ``on_frames`` sees each frame sent or received.
 
@@ -274,7 +279,7 @@ class DriveClient:
         if tick is not self._tick:
             self.prepare(tick)
         code = self._port.left() or self._exchange(deadline_ns)
-        if code == PENDING or code <= BEFORE + HANDED_BACK:
+        if code == PENDING or is_before(code):
             self._follow(0 if code == PENDING else code)
             self._send_sync()
             code = self._drain(deadline_ns, False)
@@ -287,7 +292,7 @@ class DriveClient:
         """
         if tick is not self._tick:
             self.prepare(tick)
-        if (code := self._port.left()) <= BEFORE + HANDED_BACK:
+        if is_before(code := self._port.left()):
             self._follow(code)
             code = 0
         self._conclude(code or self._drain(deadline_ns, False), deadline_ns)
@@ -295,7 +300,7 @@ class DriveClient:
     def _follow(self, code: int) -> None:
         """Take what came before SYNC as late; ``code``: what a compiled tick has left of that."""
         self._cells[_GOT] = 0
-        if code <= BEFORE + HANDED_BACK:
+        if is_before(code):
             code -= BEFORE
         self._conclude(code or self._drain(0, True), 0, late=True)
         self._cells[_GOT] = 0
