@@ -23,7 +23,7 @@ from drivers.bcm import KernelSync, all_but
 from drivers.binding import Binding, bind
 from drivers.bus import RECEIVE_BYTES, Frame, Link, SocketLink, raise_link_error, unpack_frame
 from drivers.codec import Database, Message
-from drivers.drive import Drive, DriveKind, OnFrames, Opens
+from drivers.drive import Drive, DriveKind, OnFrames, Opens, Seen
 from drivers.errors import EncodeError, LinkDown, LinkError
 from drivers.frames import (
     BUS_DOWN,
@@ -147,6 +147,7 @@ class DriveClient:
         shared = {"state": self._state, "words": self._words, "log": self._log}
         if self._timed is not None and COMPILED:
             shared["ear"] = self._timed.words
+        self._seen = np.zeros(0)
         self._port = Port(self._raw_link, shared, self._buffer_view, self._now)
 
     def _make_senders(self) -> None:
@@ -215,10 +216,20 @@ class DriveClient:
         frame.view[DATA_AT : DATA_AT + 2] = bytes((command, self.binding.node_id))
         return frame
 
+    def overhear(self) -> Seen:
+        """From now on another's commands are what the drive applies, no second master's; before a tick.
+
+        Raises DatabaseError where one message does not say all of a command.
+        """
+        rows = self.binding.counter_modulus if self.binding.map.echo else 1
+        self._seen = np.zeros(2 * rows)
+        self._port.share("seen", self._seen)
+        return self._seen
+
     def prepare(self, tick: Any) -> None:
         """Reach this tick record, so that the first tick is like the others. Raises TypeError for another."""
         raw = bytes_of(tick)
-        messages, signals, needed = incoming_tables(self.binding, tick.dtype)
+        messages, signals, needed = incoming_tables(self.binding, tick.dtype, len(self._seen) > 0)
         self._cells[_NEEDED] = needed
         self._cells[_ECHO_AT] = -1 if self.binding.map.echo else tick.dtype.fields["echo"][1]
         self._cells[_MISSING_AT] = _offset(tick, "missing") if "missing" in tick.dtype.fields else 0
@@ -564,12 +575,13 @@ class DriveClient:
 
     def saved(self) -> Saved:
         """What its frames have left in it, but for the tick; :meth:`restore` goes back there."""
-        return Saved(self._state.tobytes(), self._last.tobytes())
+        return Saved(self._state.tobytes(), self._last.tobytes(), self._seen.tobytes())
 
     def restore(self, saved: Saved) -> None:
         """Be as one was when that was saved."""
         self._state.view("u1")[:] = np.frombuffer(saved.state, np.uint8)
         self._last.view("u1")[:] = np.frombuffer(saved.counters, np.uint8)
+        self._seen.view("u1")[:] = np.frombuffer(saved.seen, np.uint8)
 
     def discard(self) -> None:
         """Throw away what was received before the run."""

@@ -15,6 +15,9 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, Final, Protocol, runtime_checkable
 
+import numpy as np
+import numpy.typing as npt
+
 from drivers.errors import DriverError
 from drivers.plugins import loaded_as, names
 
@@ -28,6 +31,9 @@ if TYPE_CHECKING:
 
 GROUP: Final = "hil.drive"
 USUAL: Final = "dbc"
+Seen = npt.NDArray[np.float64]
+"""What another controller was last heard to command with each counter, which a drive with an echo names: q, d
+[V, A or N m], then those of the next; of a drive without echo the newest alone."""
 OnFrames = Callable[[memoryview], None]
 """Takes the bytes of :data:`drivers.wire.FRAME` records, in the order in which they came and went."""
 
@@ -46,6 +52,12 @@ class Drive(Protocol):
 
     binding: Binding
     """Its messages, from the DBC and the map."""
+
+    def overhear(self) -> Seen:
+        """Before :meth:`prepare`: take another controller's commands for what the drive applies.
+
+        They no longer count as a second master's. Raises DatabaseError where that can't be.
+        """
 
     def prepare(self, tick: Any) -> None:
         """Get ready for this very record, which every tick fills; sends nothing. Once, before the first."""

@@ -36,10 +36,11 @@ NOWHERE: Final = np.full(4, -1, np.int32)
 
 
 class Saved(NamedTuple):
-    """What the frames so far have left in a client: record of the kernels, last counters, own fields."""
+    """What the frames so far have left in a client: the kernels' record, last counters, others' commands."""
 
     state: bytes
     counters: bytes
+    seen: bytes = b""
 
 
 class Compiled(NamedTuple):
@@ -80,6 +81,10 @@ class Port:
             io[TELLS] = self._called(lambda *_: now())
         self._shared: Arrays = {"fds": fds, "times": np.zeros(4, np.int64), "io": io, **shared}
         self.restart()
+
+    def share(self, name: str, array: Any) -> None:
+        """An array more that all use which are made from now on."""
+        self._shared[name] = array
 
     def _called(self, act: Callable[[int, int], int]) -> int:
         """The address of a function that kernels call; it never raises."""

@@ -29,12 +29,14 @@ from drivers.wire import (
     FD_BYTES,
     FRAME,
     MESSAGE,
+    OVERHEARD,
     REFUSED,
     SIGNAL,
     STATE,
     STATE_RAW,
     encode_command,
     note,
+    overhear,
     take,
 )
 
@@ -91,12 +93,12 @@ ARRAYS: Final = {
     "values": np.dtype("f8"), "messages": MESSAGE, "signals": SIGNAL, "last": np.dtype("i8"), "state": STATE,
     "words": np.dtype("u4"), "tick": np.dtype("u1"), "log": FRAME, "fields": np.dtype("i8"),
     "sync": np.dtype("u1"), "codes": np.dtype("i8"), "ear": np.dtype("i8"), "seldom": np.dtype("u1"),
-    "held": np.dtype("u1"),
+    "held": np.dtype("u1"), "seen": np.dtype("f8"),
 }  # fmt: skip
 """The arrays behind a kernel's places, in their order. ``fds``, ``times``, ``io`` and ``fields`` are of the
 kernels here, the others of :mod:`drivers.wire`."""
 FDS, TIMES, IO, RAW, VALUES, MESSAGES, SIGNALS, LAST = range(8)
-STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES, EAR, SELDOM, HELD = range(8, 18)
+STATES, WORDS, TICK, LOG, FIELDS, SYNC, CODES, EAR, SELDOM, HELD, SEEN_AT = range(8, 19)
 I4, I8, U1, F8, U4 = (np.dtype(kind) for kind in ("i4", "i8", "u1", "f8", "u4"))
 
 
@@ -213,6 +215,9 @@ def drain(places: Any, deadline_ns: int, late: bool) -> Any:
             raw_state: Any = np.int64(cell[0])
             cell[0] = state_of(array_at(places, CODES, I8), raw_state, state[0]["controlword"])
             seen ^= STATE_RAW
+        if seen == OVERHEARD:
+            overhear(raw, messages, signals, words, array_at(places, SEEN_AT, F8), size)
+            seen = 0
         if seen < 0 or state[0]["logged"] >= len(log) - 1 > 0:
             io[SEEN], io[SIZE] = seen, size
             return HANDED_BACK

@@ -9,11 +9,12 @@ import numpy.typing as npt
 
 from drivers.binding import Binding, Bound
 from drivers.codec import Message
+from drivers.errors import DatabaseError
 from drivers.frames import PLACES, SENT_FIELDS, SOURCES, STATUS
 from drivers.local import CLASSIC, FD, FD_BRS, FD_FDF
-from drivers.mapping import MEASURED, RECEIVED
+from drivers.mapping import COMMANDED_D, COMMANDED_Q, MEASURED, RECEIVED
 from drivers.signal import Signal
-from drivers.wire import FD_BYTES, MESSAGE, NO_SELECTOR, SIGNAL, STATE_RAW, WATCHED
+from drivers.wire import FD_BYTES, MESSAGE, NO_SELECTOR, OVERHEARD, SIGNAL, STATE_RAW, WATCHED
 
 Records = npt.NDArray[np.void]
 Row = tuple[Signal, int, int, int, bool]
@@ -55,15 +56,30 @@ class Tables:
         """Add a message that is known by its identifier alone."""
         self._messages.append((message.send_id, 0, 0, 0, 0, 0, 0, WATCHED, 0, False, NO_SELECTOR, 0, 0, 0))
 
+    def overhear(self, bound: Bound) -> None:
+        """Add a command that another controller sends.
+
+        Raises DatabaseError for u_q and u_d in two messages.
+        """
+        parts = dict(bound.parts)
+        if "u_q" in parts and "u_d" not in parts:
+            raise DatabaseError("a shadow run needs u_q and u_d in one message; drop --shadow")
+        axes = [(part, place) for place, axis in enumerate((COMMANDED_Q, COMMANDED_D)) for part in axis]
+        rows = [(bound.message.signals[parts[part]], at, 0, 0, False) for part, at in axes if part in parts]
+        self.add(bound, rows, OVERHEARD)
+
     def records(self) -> tuple[Records, Records]:
         """(messages, signals) as the kernels take them."""
         return np.array(self._messages, MESSAGE), np.array(self._signals, SIGNAL)
 
 
-def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records, Records, int]:
+def incoming_tables(
+    binding: Binding, tick: np.dtype[np.void], overhears: bool = False
+) -> tuple[Records, Records, int]:
     """(messages, signals, bits of all that measure) for :func:`drivers.wire.take` into records ``tick``.
 
-    Watched besides: what only the controller itself may send, and the drive's emergencies.
+    Watched besides: the drive's emergencies, and what only the controller itself may send; who ``overhears``
+    takes another's command for what it is. Raises DatabaseError where that can't be.
     """
     tables, needed = Tables(), 0
     for bound in binding.incoming:
@@ -78,7 +94,11 @@ def incoming_tables(binding: Binding, tick: np.dtype[np.void]) -> tuple[Records,
         seen |= STATE_RAW if "state" in parts and binding.map.states else 0
         slow = 1 << binding.slow.index(bound) if bound in binding.slow else 0
         tables.add(bound, rows, bit, seen, slow)
-    watched = [bound.message for bound in binding.outgoing] + [binding.sync, binding.emergency]
+    watched = [binding.emergency]
+    if overhears:
+        tables.overhear(binding.command)
+    else:
+        watched += [*(bound.message for bound in binding.outgoing), binding.sync]
     for message in watched:
         if message is not None:
             tables.watch(message)

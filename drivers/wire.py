@@ -30,8 +30,8 @@ STATE_RAW: Final = 1 << 16
 """What :func:`take` flags when the state that it wrote to the tick is the drive's own, to be translated."""
 UNKNOWN: Final = -1
 """What :func:`take` returns for a frame that measures nothing and yet says something to its caller."""
-WATCHED: Final = -1
-"""The ``bit`` of a message that is none to take, but of which :func:`take` returns UNKNOWN."""
+WATCHED, OVERHEARD = UNKNOWN, -2
+"""The ``bit`` of a message that is none to take: :func:`take` returns it. OVERHEARD: another's command."""
 NO_SELECTOR: Final = -1
 REFUSED: Final = -1
 """What :func:`encode` returns for a value that a signal can't carry, or a frame that says something else."""
@@ -196,6 +196,12 @@ def is_frame(raw: Any, size: int) -> bool:
 
 
 @jit
+def is_whole(raw: Any, m: Any, size: int) -> bool:
+    """Whether a frame of ``size`` bytes on the socket has its message's length."""
+    return int(raw[4]) == m["length"] and (size == FD_BYTES or m["length"] <= 8)
+
+
+@jit
 def identifier(raw: Any) -> int:
     """Identifier of a frame with SocketCAN's flag bits."""
     return int(raw[0]) | int(raw[1]) << 8 | int(raw[2]) << 16 | int(raw[3]) << 24
@@ -277,8 +283,8 @@ def take(
     """Check a frame of ``size`` bytes on the socket and apply it to the tick, whole or not at all.
 
     ``late``: the frame is checked and counted; a measurement is not applied. ``last``: each message's last
-    counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, or UNKNOWN;
-    other nodes' frames have no flags.
+    counter, -1 before the first; ``log``: room for frames, none to log nothing. Returns flags, UNKNOWN or
+    OVERHEARD; other nodes' frames have no flags.
     """
     s = state[0]
     if not is_frame(raw, size):
@@ -290,9 +296,9 @@ def take(
     if index < 0:
         return UNKNOWN if identifier(raw) & ERR_FLAG else 0
     m = messages[index]
-    if m["bit"] == WATCHED:
-        return UNKNOWN
-    if int(raw[4]) != m["length"] or (size == CLASSIC_BYTES and m["length"] > 8):
+    if m["bit"] < 0:
+        return m["bit"]
+    if not is_whole(raw, m, size):
         s["odd_id"], s["odd_length"] = identifier(raw), int(raw[4])
         return LENGTH_ERROR
     if not is_valid(raw, m):
@@ -314,6 +320,25 @@ def take(
     if m["bit"] == 0:
         return (flags & ~FRESH) | m["seen"]
     return complete(s, m, tick, flags) | m["seen"]
+
+
+@jit
+def overhear(raw: Any, messages: Any, signals: Any, words: Any, seen: Any, size: int) -> None:
+    """Write what another controller commands to ``seen``, the frame whole and valid or not at all.
+
+    ``seen``: (q, d) [V, A or N m] by the command's counter, one after the other; or the newest alone.
+    """
+    m = messages[find(raw, messages)]
+    if not (is_whole(raw, m, size) and is_valid(raw, m)):
+        return
+    first, at = m["first"], 0
+    if m["modulus"] > 0:
+        at = 2 * (int(phys_of(raw, m["length"], signals[first], words)) % (len(seen) // 2))
+        first += 1
+    seen[at + 1] = 0.0
+    for place in range(first, m["first"] + m["count"]):
+        g = signals[place]
+        seen[at + g["at"]] = phys_of(raw, m["length"], g, words)
 
 
 @jit

@@ -13,7 +13,6 @@ from drivers.bus import Frame
 from drivers.drive import drive_kind
 from drivers.mapping import MEASURED
 from drivers.port import Saved
-from drivers.watch import CommandWatch
 from hil.exchange.periods import MOST_NS, Grid, Heard, Period, Roles, around
 from hil.exchange.readers.recorded import ID_MASK
 from hil.runtime.loop import ENDED
@@ -112,8 +111,7 @@ class Run:
         self._client = drive_kind(config.drive.kind).open(
             self.tape, setup.database, load=load, drive_map=setup.binding.map, now=lambda: 0
         )
-        self._watch = CommandWatch(setup.binding) if self.shadow else None
-        self._drive = ShadowDrive(self._client, self._watch.applied) if self._watch else self._client
+        self._drive = ShadowDrive(self._client, self._client.overhear()) if self.shadow else self._client
         self._machine, self.ticks = setup.machine.fresh(), new_ticks()
         machine = self._machine
         records = machine.safety_state, machine.law_state, machine.setpoint_state, self.ticks
@@ -266,10 +264,8 @@ class Run:
         if not orderly:
             self.ticks["request"] = request
         self._machine.step(self.ticks)
-        if self._watch is not None:
-            for frame in period.commands:
-                if frame.can_id == self._setup.binding.command.message.send_id:
-                    self._watch.take(frame.data)
+        if self.shadow:  # it hears what answers this tick before the next one's feedback
+            self._left = [*period.commands, *self._left]
 
     def _sends(self, period: Period) -> bool:
         """Whether the tick's command is the recorded one; after the last come those that stop the drive."""

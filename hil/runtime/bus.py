@@ -16,7 +16,6 @@ from drivers.drive import OnFrames, drive_kind
 from drivers.errors import DriverError
 from drivers.kernel import interface_facts
 from drivers.lockstep import LockstepLink
-from drivers.watch import CommandWatch
 from hil.config.tables import RunConfig
 from hil.errors import ArmingError
 from hil.log.recorder import Recorder
@@ -106,14 +105,11 @@ def sending_bus(
 
 @contextlib.contextmanager
 def opened_client(
-    setup: Setup,
-    recorder: Recorder | None,
-    clock: RealClock | LockstepClock,
-    watch: CommandWatch | None = None,
+    setup: Setup, recorder: Recorder | None, clock: RealClock | LockstepClock
 ) -> Iterator[BusDrive]:
-    """A drive client on the configured bus, closed in the end; ``watch`` sees each frame, too."""
+    """A drive client on the configured bus, closed in the end."""
     on_frames = recorder.frames if recorder and setup.config.log.frames else None
-    client = new_client(setup, watch.chained(on_frames) if watch else on_frames, clock.now_ns, controls=True)
+    client = new_client(setup, on_frames, clock.now_ns, controls=True)
     try:
         yield client
     finally:

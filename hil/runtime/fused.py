@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from drivers.client import FLUSH_AT
-from drivers.drive import Drive
+from drivers.drive import Drive, Seen
 from drivers.jit import COMPILED, array_at, entry, jit, place_of, places_at, waiting
 from drivers.posix import (
     EAR,
@@ -71,6 +71,7 @@ from hil.runtime.rules import (
     run_tick,
     since,
 )
+from hil.runtime.shadow import note_applied
 from hil.signals import TICK, TickArray
 from hil.tick.kernel import whole_at
 
@@ -90,13 +91,15 @@ _clock_nanosleep = _types.ExternalFunction(
 )
 THREAD_CPUTIME, ABSOLUTE = 3, 1
 I8: Final = np.dtype(np.int64)
+F8: Final = np.dtype(np.float64)
 
 (
     RECEIVE, COMMAND, LAW, TICKS_IN, FRAMES_IN, TIMES_AT, WORDS, PLAN, TICK_AT, MARKS, PACE, REQUEST, CLOCK,
-    NUMBER, ROWS,
-) = range(15)  # fmt: skip
+    SEEN, NUMBER, ROWS,
+) = range(16)  # fmt: skip
 """Rows of the table: places of the kernels' own tables of places, then of arrays. CLOCK: the cell of a
-:class:`hil.runtime.clock.LockstepClock`, of no length in real time."""
+:class:`hil.runtime.clock.LockstepClock`, of no length in real time. SEEN: what a shadow has overheard, of no
+length in a run that sends."""
 PARTS: Final = sys.modules[__name__]
 """The parts of a tick are functions of this module; a kernel takes a module, but no tuple of functions."""
 TOGETHER_NS: Final = 4_000_000
@@ -119,12 +122,13 @@ def whole_tick(
     number: memoryview | None = None,
     marks: Marks | None = None,
     clock: Cell = RealClock.cell,
+    seen: Seen | None = None,
 ) -> Whole:
     """The ticks of a run; a client that is not compiled leaves them to the loop.
 
     The client must be prepared for the recorder's record, and for no other later; the pace is the loop's.
     ``number``: of the newest set-point that was asked for, in memory that outlives the run; no array of it
-    stays, which would keep it from being released. ``clock``: the cell of the loop's.
+    stays, which would keep it from being released. ``clock``: the cell of the loop's. ``seen``: a shadow's.
     """
     ports = client.compiled()
     if ports is None:
@@ -132,7 +136,7 @@ def whole_tick(
     receive = ports.exchange if plan.pacing == "sync" else ports.receive
     timing = timing_of(plan, client.timed is not None, ports.sync_bytes)
     tables = [receive, ports.command, machine.places(), *recorder.places(ports.log)]
-    table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks, clock)
+    table, alive = table_of(tables, timing, recorder.record, words, request, pace, number, marks, clock, seen)
     call = partial(compiled_of(run_ticks, ROWS), table)
     call.__dict__["alive"] = (client, machine, recorder, alive)  # the places are of them
     return call
@@ -148,6 +152,7 @@ def table_of(
     number: memoryview | None,
     marks: Marks | None,
     clock: Cell,
+    seen: Seen | None = None,
 ) -> tuple[npt.NDArray[np.int64], Any]:
     """The table of a compiled tick, RECEIVE to NUMBER; beside it what must live as long.
 
@@ -155,9 +160,11 @@ def table_of(
     """
     shared = np.frombuffer(words.cells, np.int64) if words else np.zeros(0, np.int64)
     marks, asked = np.zeros(0, np.int64) if marks is None else marks, np.zeros(1, np.int64)
-    arrays = [np.zeros(4, np.int64), shared, timing, record, marks, pace, request.cell, clock]
+    heard = np.zeros(0) if seen is None else seen
+    arrays = [np.zeros(4, np.int64), shared, timing, record, marks, pace, request.cell, clock, heard]
+    kinds = {id(record): TICK, id(heard): F8}
     rows = [place_of(table.reshape(-1), I8) for table in tables]
-    rows += [place_of(array, TICK if array is record else I8) for array in arrays]
+    rows += [place_of(array, kinds.get(id(array), I8)) for array in arrays]
     rows.append(place_of(asked if number is None else np.frombuffer(number, np.int64), I8))
     return np.array(rows), (tables, arrays, asked)
 
@@ -251,6 +258,8 @@ def begun(table: Any, _t: Any) -> None:
 @jit
 def sync(table: Any, t: Any, deadline_ns: int) -> Any:
     """SYNC and feedback."""
+    if len(array_at(table, SEEN, F8)) > 0:
+        return False
     words, places = array_at(table, WORDS, I8), places_at(table, RECEIVE)
     if len(words) > 0 and beats(words, now(table)):
         return False
@@ -264,7 +273,12 @@ def receive(table: Any, t: Any, deadline_ns: int) -> Any:
     s = array_at(places, STATES, STATE)[0]
     if s["pending"] != 0 or s["down"] != 0 or (len(words) > 0 and words[FIRED] != 0):
         return False
-    return taken(table, t, drain(places, deadline_ns, False))
+    if not taken(table, t, drain(places, deadline_ns, False)):
+        return False
+    seen = array_at(table, SEEN, F8)
+    if len(seen) > 0:
+        note_applied(t, seen, deadline_ns)
+    return True
 
 
 @jit
@@ -303,6 +317,8 @@ def answer(table: Any, t: Any) -> Any:
     words, times = array_at(table, WORDS, I8), array_at(table, TIMES_AT, I8)
     places = places_at(table, COMMAND)
     if t["send"] != 0:
+        if len(array_at(table, SEEN, F8)) > 0:
+            return False
         if len(words) > 0 and commands(words, now_ns(times), t["state"], t["counter"]):
             return False
         if left(places, command(places)):

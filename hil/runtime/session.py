@@ -15,7 +15,6 @@ from drivers.client import precompile
 from drivers.drive import Drive as BusDrive
 from drivers.drive import drive_kind
 from drivers.errors import DriverError, LinkError
-from drivers.watch import CommandWatch
 from hil.config.design import Machine
 from hil.config.tables import RunConfig
 from hil.errors import ArmingError, HilError
@@ -28,7 +27,7 @@ from hil.runtime.clock import LockstepClock, RealClock
 from hil.runtime.guardian import GuardedDrive, Rights, Stopper, Words, guardian
 from hil.runtime.header import header_of, log_path
 from hil.runtime.inbox import Inbox, Place, Takes, ranges
-from hil.runtime.loop import Loop, Outcome, Plan, StopRequest, no_whole
+from hil.runtime.loop import Loop, Outcome, Plan, StopRequest
 from hil.runtime.progress import say, watching
 from hil.runtime.refusals import check_arming, check_load, check_reachable, check_set_up, needed_bytes
 from hil.runtime.registry import announced, own_entry, who_asked
@@ -163,31 +162,32 @@ def _recorded(
 ) -> RunResult:
     """Open the drive and the log, arm, run."""
     config = setup.config
-    watch = CommandWatch(setup.binding) if config.loop.shadow else None
-    with opened_client(setup, recorder, clock, watch) as client:
+    shadow = config.loop.shadow
+    with opened_client(setup, recorder, clock) as client:
+        seen = client.overhear() if shadow else None
         recorder.begin(header_of(setup, "run", clock.name))  # meanwhile the drive may be heard
-        asked = not watch and drive_kind(config.drive.kind).asked
+        asked = not shadow and drive_kind(config.drive.kind).asked
         if asked:  # who asks has listened
             hear_others(setup, client)
-        if watch or not setup.binding.map.poll:
+        if shadow or not setup.binding.map.poll:
             say(f"waiting for the drive on {config.bus.interface}:{config.bus.channel}")
             await_drive(setup, client, asked)
-        if not (watch or asked):
+        if not (shadow or asked):
             hear_others(setup, client)
         recorder.await_open()
-        say(f"{'listening only' if watch else 'arming'}; log {recorder.path}")
-        drive: Drive = ShadowDrive(client, watch.after(client.flush)) if watch else client
+        say(f"{'listening only' if shadow else 'arming'}; log {recorder.path}")
+        drive: Drive = client if seen is None else ShadowDrive(client, seen)
         if words:
             drive = GuardedDrive(client, words, clock.now_ns, client.timed)
-        if watch:
+        if shadow:
             recorder.event(clock.now_ns(), 0, "shadow", "reads and computes, sends nothing")
         machine, plan = setup.machine.fresh(), plan_of(config)
         plan = replace(plan, together=fused.together(plan.period_ns, request))
         machine = machine if request.ramps else machine.at_once()
         takes = set_by_others(setup)
-        with contextlib.closing(Inbox(Place(machine, takes))) as inbox, _started(None if watch else client):
+        with contextlib.closing(Inbox(Place(machine, takes))) as inbox, _started(None if shadow else client):
             compiled = partial(fused.whole_tick, client, words, machine, recorder, plan, request)
-            whole = no_whole if watch else partial(compiled, number=inbox.number, clock=clock.cell)
+            whole = partial(compiled, number=inbox.number, clock=clock.cell, seen=seen)
             parts = drive, clock, recorder, machine.looped(), recorder.record, plan, request, whole
             loop = Loop(*parts, inbox if takes else None, client.timed)
             client.discard()

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from hil.ports import Drive
-from hil.runtime.rules import NO_WAIT
-from hil.signals import RxFlag
+from hil.runtime.rules import FRESH, NO_WAIT, rule
 
-Applied = Callable[[int], tuple[float, float]]
+
+@rule
+def note_applied(t: Any, seen: Any, deadline_ns: int) -> None:
+    """Write to the tick what the drive applies from now on: what was ``seen`` with the counter of its echo.
+
+    A look for more feedback that finds none may find the command that answers this one: not applied yet.
+    """
+    if t["rx_flags"] & FRESH or deadline_ns != NO_WAIT:
+        at = 2 * (int(t["echo"]) % (len(seen) // 2))
+        t["u_q_seen"], t["u_d_seen"] = seen[at], seen[at + 1]
 
 
 class ShadowDrive:
     """Wraps a drive: feedback passes, nothing is sent, not even SYNC or the stop frames.
 
-    ``applied`` gives the voltages (u_q, u_d) [V] that another controller sent with a counter; the drive's
-    echo names that counter. Commands of others are what a shadow expects, so they are no reason to stop.
+    ``seen``: what the drive's client overhears of another controller's commands.
     """
 
-    def __init__(self, drive: Drive, applied: Applied) -> None:
-        self._drive, self._applied = drive, applied
+    def __init__(self, drive: Drive, seen: Any) -> None:
+        self._drive, self._seen = drive, seen
 
     def prepare(self, tick: Any) -> None:
         """Get ready for the record."""
@@ -33,10 +39,7 @@ class ShadowDrive:
     def receive(self, tick: Any, deadline_ns: int) -> None:
         """Wait for feedback; note what the other controller has applied from now on."""
         self._drive.receive(tick, deadline_ns)
-        flags = tick["rx_flags"] = int(tick["rx_flags"]) & ~int(RxFlag.FOREIGN_COMMAND)
-        # a look for more feedback that finds none may find the command that answers this one: not applied yet
-        if flags & RxFlag.FRESH or deadline_ns != NO_WAIT:
-            tick["u_q_seen"], tick["u_d_seen"] = self._applied(int(tick["echo"]))
+        note_applied(tick, self._seen, deadline_ns)
 
     def send(self, tick: Any) -> None:
         """Send nothing, and say so in the tick."""

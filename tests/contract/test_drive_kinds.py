@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from drivers.bus import Frame
@@ -152,6 +153,33 @@ def test_a_kind_hears_another_master(kind: str) -> None:
         tick["rx_flags"] = 0
         drive.receive(tick, 0)
         assert int(tick["rx_flags"]) & FOREIGN_COMMAND
+
+
+@pytest.mark.parametrize("kind", RUNS)
+def test_a_kind_overhears_what_another_commands(kind: str) -> None:
+    """No second master's then, and nothing is sent."""
+    setup, wire, drive = opened(kind)
+    seen, tick, command = drive.overhear(), new_ticks()[0], setup.binding.command
+    drive.prepare(tick)
+    assert len(seen) == 2 * (command.counter_modulus if setup.binding.map.echo else 1)
+    parts = dict(command.parts)
+    axes = [[parts[part] for part in axis if part in parts] for axis in (COMMANDED_Q, COMMANDED_D)]
+    values = {name: 0.5 * (1 + place) for place, names in enumerate(axes) for name in names}
+    counter = {command.counter: 3} if command.counter else {}
+    data = command.message.encode({**dict.fromkeys(command.message.signals, 0), **values, **counter})
+    for sent in (data, data[:-1]):
+        wire.queue.append(Frame(command.message.can_id, sent, 0, command.message.fd))
+    tick["rx_flags"] = 0
+    drive.receive(tick, 0)
+    assert not int(tick["rx_flags"]) and wire.sent == []
+    row = 3 if setup.binding.map.echo else 0
+    wanted = np.zeros((len(seen) // 2, 2))
+    wanted[row] = [0.5 if axes[0] else 0.0, 1.0 if axes[1] else 0.0]
+    assert seen.reshape(-1, 2) == pytest.approx(wanted, abs=1e-3)
+    saved = drive.saved()
+    seen[:] = 9.0
+    drive.restore(saved)
+    assert seen.reshape(-1, 2) == pytest.approx(wanted, abs=1e-3)
 
 
 @pytest.mark.parametrize("kind", RUNS)

@@ -70,7 +70,9 @@ from hil.runtime.rules import (
     Pacing,
     new_pace,
 )
+from hil.runtime.session import plan_of
 from hil.runtime.setup import Overrides, Setup, load_setup
+from hil.runtime.shadow import ShadowDrive
 from hil.signals import FIELDS, Reason, Request, RxFlag, TickArray
 from tests.conftest import CONFIGS
 from tests.contract import virtual
@@ -91,7 +93,8 @@ class Drive:
 
     def __init__(self, setup: Setup, end: socket.socket, words: Words, act: Act) -> None:
         self.end, self.words, self._act = end, words, act
-        self._feedback, self._status = (setup.database.message(name) for name in ("FEEDBACK", "STATUS"))
+        messages = map(setup.database.message, ("FEEDBACK", "STATUS", "COMMAND"))
+        self._feedback, self._status, self._command = messages
         self.counter = self._echo = self._state = self._beats = self._deaf_until = 0
         self.operator, self.speed = StopRequest(), 0.0
         self.tells, self._asked = False, b""
@@ -234,6 +237,33 @@ class Timed(Drive):
         self.sync.close()
         self.job.close()
         self.ear.close()
+
+
+class Beside(Drive):
+    """Another controller drives it, which the loop only listens to; ``commands``: how, for the n-th time."""
+
+    commands: Act
+
+    def begin(self) -> None:
+        super().begin()
+        TIME.after(PERIOD_NS, self.beat)
+
+    def beat(self) -> None:
+        n = self._beats
+        self.end.send(sync_frame(n))
+        super().beat()
+        with contextlib.suppress(OSError):
+            self.commands(self, n)
+        TIME.after(PERIOD_NS, self.beat)
+
+    def hears(self, can_id: int) -> None:
+        raise AssertionError(f"a shadow has sent 0x{can_id:X}")
+
+    def command(self, n: int) -> bytes:
+        """The n-th command, never twice the same; the drive echoes it from the next answer on."""
+        self._echo, self._state = n % 16, STATES[0xF if n > 5 else 0x6]
+        values = {"Counter": n % 16, "Controlword": 0xF, "VoltageQ": 0.05 * n, "VoltageD": -0.01 * (n % 9)}
+        return pack_frame(COMMAND, self._command.encode({"Mode": 0, **values}))
 
 
 Act = Callable[[Any, int], None]
@@ -532,13 +562,14 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
     together: list[int] = []
     words, machine = Words(), setup.machine.fresh()
     words.cells[GUARD_NS] = TIME.now_ns
-    pacing = setup.config.loop.pacing
+    shadow, pacing = setup.config.loop.shadow, plan_of(setup.config).pacing
     plan = Plan(PERIOD_NS, TIMEOUT_NS, pacing, TICKS, 3 if case[0] == "seldom" else 1, TOGETHER)
     recorder = Recorder(path, header_of(setup, "run", "monotonic"), 1000)
     recorder.await_open()
     failure = ""
     with ends() as (ours, theirs):
         other = Timed if case[0] == "by the kernel" else Drive if pacing == "sync" else Cyclic
+        other = Beside if shadow else other
         drive = other(setup, theirs, words, act)
         sync = drive.sync if isinstance(drive, Timed) else None
         link: Link = Plain(ours) if case[0] in PLAIN else SocketLink(None, ours, ours)
@@ -546,11 +577,13 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
         if isinstance(clock, LockstepClock):
             link, drive.tells = LockstepLink(link, SYNC), True
         client = DriveClient(link, setup.database, on_frames=recorder.frames, now=clock.now_ns, timed=sync)
-        told = words if isinstance(clock, RealClock) else None  # where time stands still nobody watches
+        real = isinstance(clock, RealClock)
+        told = words if real and not shadow else None  # where time stands still, or nothing is sent
+        seen = client.overhear() if shadow else None
 
         def counted(pace: Pace) -> Whole:
             parts = client, told, machine, recorder, plan, request, pace, page.number
-            made = fused.whole_tick(*parts, clock=clock.cell)
+            made = fused.whole_tick(*parts, clock=clock.cell, seen=seen)
 
             def whole(*args: Any) -> int:
                 stage = made(*args)
@@ -563,10 +596,8 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
 
             return whole
 
-        guarded, record = (
-            GuardedDrive(client, told, time.monotonic_ns, sync) if told else client,
-            recorder.record,
-        )
+        guarded = GuardedDrive(client, told, time.monotonic_ns, sync) if told else client
+        guarded, record = guarded if seen is None else ShadowDrive(client, seen), recorder.record
         whole = counted if compiled else no_whole
         parts = guarded, clock, recorder, machine.looped(), record, plan, request, whole
         page = Inbox(Place(machine, ranges(machine, "cascade")))
@@ -580,6 +611,7 @@ def run(settings: tuple[str, ...], path: Path, case: tuple[str, str], compiled: 
             outcome, failure = loop._outcome, f"{type(error).__name__}: {error}"
         finally:
             drive.stop()
+            client.flush()
             recorder.close({"ended": "in time"})
             page.close()
     if TIME.trouble:
@@ -714,6 +746,60 @@ BY_THE_KERNEL: dict[str, tuple[Act, set[int], str]] = {
     "emergency": (timed(alarm), {SENT, BEGUN}, "STOP_REQUESTED"),
     "the guardian fires": (timed(fired), {SENT, BEGUN}, "GUARDIAN"),
 }
+
+
+def beside(commands: Act, feedback: Act = calm) -> Act:
+    """Another controller's command after the drive's answer, and how both are."""
+
+    def act(drive: Beside, n: int) -> None:
+        drive.commands = commands
+        feedback(drive, n)
+
+    return act
+
+
+def commanded(drive: Beside, n: int) -> None:
+    """At once: who looks for more feedback finds it."""
+    drive.end.send(drive.command(n))
+
+
+def commanded_later(drive: Beside, n: int) -> None:
+    """While the loop waits for the next feedback."""
+    raw = drive.command(n)
+    TIME.after(PERIOD_NS // 3, lambda: drive.end.send(raw) and None)
+
+
+def spoiled(drive: Beside, n: int) -> None:
+    """Commands with a wrong CRC, a wrong length and as a remote frame: none is what the drive applies."""
+    raw = bytearray(drive.command(n))
+    drive.end.send(raw)
+    raw[-1] ^= 1
+    for other in (raw, pack_frame(COMMAND, bytes(7)), pack_frame(COMMAND | 0x40000000, b"")):
+        drive.end.send(other)
+
+
+def commanded_twice(drive: Beside, n: int) -> None:
+    """Another one with the same counter: the newest counts."""
+    drive.end.send(drive.command(n + 1))
+    commanded(drive, n)
+
+
+OVERHEARD: dict[str, tuple[Act, set[int], str]] = {
+    # another controller drives the drive, and a shadow listens
+    "calm": (beside(commanded), {SENT}, "STOP_REQUESTED"),
+    "commands later": (beside(commanded_later), {SENT}, "STOP_REQUESTED"),
+    "spoiled commands": (beside(spoiled), {SENT}, "STOP_REQUESTED"),
+    "commands twice": (beside(commanded_twice), {SENT}, "STOP_REQUESTED"),
+    "no command": (beside(lambda *_: None), {SENT}, "STOP_REQUESTED"),
+    "no feedback": (beside(commanded, silent), {SENT}, "STOP_REQUESTED"),
+    "a heap": (beside(commanded, heap), {SENT}, "STOP_REQUESTED"),
+    "emergency behind feedback": (beside(commanded, emergency_behind), {SENT, BEGUN}, "STOP_REQUESTED"),
+    "emergency": (beside(commanded, alarm), {SENT, BEGUN}, "STOP_REQUESTED"),
+    "strangers' frames": (beside(commanded, strangers), {SENT}, "STOP_REQUESTED"),
+    "a stop": (beside(commanded, stopped), {SENT}, "STOP_REQUESTED"),
+}
+
+
 BY_THE_TIMER: dict[str, tuple[Act, set[int], str]] = {
     # nobody sends SYNC, and the loop takes what is there
     "calm": (calm, {SENT}, "STOP_REQUESTED"),
@@ -725,7 +811,7 @@ BY_THE_TIMER: dict[str, tuple[Act, set[int], str]] = {
 }
 
 
-PLAIN = ("no descriptor", "in lockstep")
+PLAIN = ("no descriptor", "in lockstep", "a shadow without a descriptor")
 """Where the bus is Python's; and in lockstep time is a word that goes from tick to tick."""
 STANDING_STILL = (
     "calm", "wrong crc", "jump of the counter", "no feedback", "late feedback", "emergency",
@@ -738,6 +824,9 @@ TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
     "by feedback": FOLLOWED,
     "by the kernel": BY_THE_KERNEL,
     "by the timer": BY_THE_TIMER,
+    "a shadow": OVERHEARD,
+    "a shadow by the timer": {name: OVERHEARD[name] for name in ("calm", "commands later", "a heap")},
+    "a shadow without a descriptor": OVERHEARD,
     "no descriptor": CASES,
     "in lockstep": {name: CASES[name] for name in STANDING_STILL},
     "ramp": {"stop": (stopped, set(), "STOP_REQUESTED")},
@@ -748,7 +837,8 @@ TABLES: dict[str, dict[str, tuple[Act, set[int], str]]] = {
 
 PACED = {
     "by us": "sync", "by feedback": "feedback", "by the kernel": "feedback", "by the timer": "timer",
-    "no descriptor": "sync", "in lockstep": "sync",
+    "no descriptor": "sync", "in lockstep": "sync", "a shadow": "sync", "a shadow by the timer": "timer",
+    "a shadow without a descriptor": "feedback",
 }  # fmt: skip
 UNSURE = ("the other end is gone", "the queue is full", "the guardian fires")
 """Where the drive does not listen to the end, not all of the stages need come."""
@@ -757,7 +847,8 @@ UNSURE = ("the other end is gone", "the queue is full", "the guardian fires")
 @pytest.mark.parametrize(("by", "name"), [(by, name) for by in PACED for name in TABLES[by]])
 def test_a_compiled_tick_is_the_loops_own(by: str, name: str, both: Both) -> None:
     _, left, ended = TABLES[by][name]
-    rules, compiled = both((by, name), f'loop.pacing="{PACED[by]}"')
+    shadow = ("loop.shadow=true",) if by.startswith("a shadow") else ()
+    rules, compiled = both((by, name), f'loop.pacing="{PACED[by]}"', *shadow)
     assert_same(rules, compiled)
     stages = set(compiled.stages) - {RECORDED}
     assert stages <= left and (stages == left or name in UNSURE), compiled.stages
@@ -783,10 +874,26 @@ def the_kernel_counts(ran: Ran, name: str) -> None:
     assert len(syncs) > 40 and [s.data[0] for s in syncs[:40]] == list(range(1, 41))
 
 
+def others_commands_are_applied(ran: Ran, name: str) -> None:
+    """Of each tick in which the drive is driven what its echo names, and nothing was sent."""
+    ticks = ran.log.ticks
+    assert not ticks["send"].any() and ran.heard == []
+    if name == "no command":
+        assert not ticks["u_q_seen"].any()
+        return
+    driven = ticks[(ticks["rx_flags"] & int(RxFlag.FRESH) != 0) & (ticks["drive_state"] == 4)]
+    number = np.round(driven["u_q_seen"] / 0.05).astype(int)
+    assert len(driven) > 60 and (number % 16 == driven["echo"]).all()
+    assert np.allclose(driven["u_d_seen"], -0.01 * (number % 9)) and (np.diff(number) >= 1).all()
+
+
 AND: dict[str, Callable[[Ran, str], None]] = {
     "by the kernel": the_kernel_counts,
     "by the timer": feedback_ages,
     "a set-point": a_set_point_is_taken,
+    "a shadow": others_commands_are_applied,
+    "a shadow by the timer": others_commands_are_applied,
+    "a shadow without a descriptor": others_commands_are_applied,
 }
 """What is checked besides, by who sends SYNC or by what happens."""
 

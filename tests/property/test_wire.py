@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +12,24 @@ import pytest
 
 from drivers.binding import Binding, Bound, bind
 from drivers.codec import Database
-from drivers.errors import EncodeError
+from drivers.errors import DatabaseError, EncodeError
 from drivers.frames import COUNTER_JUMP, COUNTER_REPEATED, CRC_ERROR, FRESH, LENGTH_ERROR, SOURCES
 from drivers.local import ERR_FLAG, FD, pack_frame
-from drivers.mapping import RECEIVED, house_map
-from drivers.tables import incoming_tables, laid_out, outgoing_tables
-from drivers.wire import FRAME, MESSAGE, ROOM, SIGNAL, STATE, UNKNOWN, encode, phys_of, take
+from drivers.mapping import COMMANDED_D, COMMANDED_Q, RECEIVED, house_map
+from drivers.tables import Tables, incoming_tables, laid_out, outgoing_tables
+from drivers.wire import (
+    FRAME,
+    MESSAGE,
+    OVERHEARD,
+    ROOM,
+    SIGNAL,
+    STATE,
+    UNKNOWN,
+    encode,
+    overhear,
+    phys_of,
+    take,
+)
 from hil.log.schema import FRAME as LOGGED_FRAME
 from hil.runtime.setup import Overrides, load_setup
 from hil.signals import TICK, new_ticks
@@ -42,9 +55,9 @@ BINDINGS = {
 class Taker:
     """The receiving kernel over a tick of its own."""
 
-    def __init__(self, binding: Binding) -> None:
+    def __init__(self, binding: Binding, overhears: bool = False) -> None:
         self.ticks = new_ticks()
-        self.messages, self.signals, needed = incoming_tables(binding, TICK)
+        self.messages, self.signals, needed = incoming_tables(binding, TICK, overhears)
         self.state, self.log = np.zeros(1, STATE), np.zeros(ROOM, FRAME)
         self.state["needed"], self.state["echo_at"] = needed, -1
         self.last, self.words = np.full(len(self.messages), -1), np.zeros(2, np.uint32)
@@ -239,3 +252,34 @@ def test_commands_are_laid_out_as_the_codec_says(kind: str) -> None:
 
 def test_frames_are_logged_as_hil_lays_them_out() -> None:
     assert FRAME == LOGGED_FRAME
+
+
+@pytest.mark.parametrize("kind", BINDINGS)
+@pytest.mark.parametrize("rows", [1, 16])
+def test_a_command_is_overheard_as_the_codec_says(kind: str, rows: int) -> None:
+    """Whole and valid or not at all, by its counter; of a drive without echo the newest."""
+    bound, rng = BINDINGS[kind].command, np.random.default_rng(rows)
+    taker, seen = Taker(BINDINGS[kind], overhears=True), np.zeros(2 * rows)
+    parts, wanted = dict(bound.parts), np.zeros((rows, 2))
+    axes = [next((parts[part] for part in axis if part in parts), "") for axis in (COMMANDED_Q, COMMANDED_D)]
+    taken = 0
+    for raw in random_frames(bound, rng, 200):
+        assert taker.take(raw) == OVERHEARD and taker.state["logged"] == 1
+        size = len(raw) if rng.random() > 0.1 else 72 + 16 - len(raw)
+        args: Any = (taker.messages, taker.signals, taker.words, seen)
+        overhear(taker.buffer, *args, size)
+        data = raw[8 : 8 + bound.message.length]
+        if bound.message.valid(data) and (size == 72 or bound.message.length <= 8):
+            counter = int(bound.message.reader(bound.counter)(data)[0]) if bound.counter else 0
+            wanted[counter % rows] = [bound.message.reader(name)(data)[0] if name else 0.0 for name in axes]
+            taken += 1
+        assert seen.tobytes() == wanted.tobytes()
+    assert 50 < taken < 200 or bound.message.profile == 0
+
+
+def test_a_shadow_of_a_drive_with_two_voltages_in_two_messages_is_refused() -> None:
+    database = Database(CONFIGS / "drives/hil_pmsm.dbc")
+    binding = bind(house_map(database), database)
+    bound = replace(binding.command, parts=tuple(row for row in binding.command.parts if row[0] != "u_d"))
+    with pytest.raises(DatabaseError, match="u_q and u_d in one message; drop --shadow"):
+        Tables().overhear(bound)
