@@ -87,7 +87,8 @@ class KernelSync:
     ) -> None:
         self.send_id, self._steering = send_id, Steering(period_ns)
         counts = range(1, SYNC_COUNTS + 1) if counted else range(1)
-        self._frames = [CLASSIC.pack(send_id, counted, bytes((count,))) for count in counts]
+        self._count = len(counts)
+        self._frames = b"".join(CLASSIC.pack(send_id, counted, bytes((count,))) for count in counts)
         self._job, self._ear = job, ear
         self._going = False
         self._lay_out(period_ns)
@@ -117,8 +118,8 @@ class KernelSync:
 
     def _setup(self, flags: int) -> None:
         interval = divmod(self._steering.interval_us, 1_000_000)
-        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, len(self._frames))
-        self._job.send(head + b"".join(self._frames))
+        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, self._count)
+        self._job.send(head + self._frames)
 
     def taken(self) -> tuple[int, int]:
         """How many SYNCs were heard since the last look, and when the newest was [ns]."""

@@ -844,7 +844,18 @@ UNSURE = ("the other end is gone", "the queue is full", "the guardian fires")
 """Where the drive does not listen to the end, not all of the stages need come."""
 
 
-@pytest.mark.parametrize(("by", "name"), [(by, name) for by in PACED for name in TABLES[by]])
+FURTHER = ("a shadow by the timer", "a shadow without a descriptor")
+"""Ways of what has rows for each of its parts already."""
+
+
+@pytest.mark.parametrize(
+    ("by", "name"),
+    [
+        pytest.param(by, name, marks=[pytest.mark.long] if by in FURTHER else [])
+        for by in PACED
+        for name in TABLES[by]
+    ],
+)
 def test_a_compiled_tick_is_the_loops_own(by: str, name: str, both: Both) -> None:
     _, left, ended = TABLES[by][name]
     shadow = ("loop.shadow=true",) if by.startswith("a shadow") else ()
