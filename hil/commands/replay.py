@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hil.commands.common import Commands, one_run, print_json, say
+from hil.commands.common import Commands, keep_memory, one_run, print_json, say
 from hil.log.outputs import output_file, output_log
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ def register(commands: Commands) -> None:
 
 def cmd_replay(args: argparse.Namespace) -> int:
     """Replay logs."""
+    keep_memory()
     from hil.errors import HilError
     from hil.log.parts import grouped
     from hil.replay import Window

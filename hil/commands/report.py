@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from hil.commands.common import EXIT_FAILED, Commands, one_thread, print_json
+from hil.commands.common import EXIT_FAILED, Commands, keep_memory, one_thread, print_json
 from hil.log.outputs import output_file
 
 
@@ -23,6 +23,7 @@ def register(commands: Commands) -> None:
 def cmd_report(args: argparse.Namespace) -> int:
     """Write a report."""
     one_thread()
+    keep_memory()
     from hil.identify.section import identification
     from hil.log.parts import grouped
     from hil.report.build import build

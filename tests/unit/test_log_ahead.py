@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import platform
 import signal
+import subprocess
+import sys
 import threading
 from collections.abc import Generator
 from dataclasses import asdict
@@ -133,3 +136,29 @@ def test_verdict_and_report_do_not_depend_on_it(path: Path, monkeypatch: pytest.
     assert again.verdict == report.verdict and known(again.log) == known(report.log)
     for one, other in zip(again.curves(), report.curves(), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+BLOCKS = """
+import resource, sys
+import numpy as np
+from hil.commands.common import keep_memory
+if sys.argv[1] == "kept":
+    keep_memory()
+faults = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for turn in range(200):
+    if turn == 20:
+        begin = faults()
+    blocks = [np.ones(430_000, np.uint8) for _ in range(5)]
+    del blocks
+print(faults() - begin)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries stay as they are")
+def test_what_is_freed_is_kept_for_the_next_blocks() -> None:
+    """Pages that the system clears anew, with blocks of the size of a log's."""
+    found = {}
+    for way in ("kept", "usual"):
+        done = subprocess.run([sys.executable, "-c", BLOCKS, way], capture_output=True, text=True, check=True)
+        found[way] = int(done.stdout)
+    assert found["kept"] < 1000 and found["usual"] > 50_000, found
