@@ -25,6 +25,8 @@ from hil.tick.kernel import new_safety_state
 from hil.tick.setpoint import new_setpoint_state, no_setpoint, prepare
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 PATH = CONFIGS / "position.toml"
 MOTOR = MotorModel(2.875, 0.033, 0.033, 0.8, 3, 0.011, 2e-4)
 FTDOB = ChannelSpec("ftdob", 25.0, 58.0, 0.012)

@@ -18,6 +18,8 @@ from hil.tick.setpoint import new_setpoint_state
 from hil.tick.undo import WHOLE, Undo, keep
 from tests.conftest import CONFIGS
 
+pytestmark = pytest.mark.slow
+
 TICKS = 1500
 """More than the longest ring has entries."""
 PLL = ("drive.speed_filter.kind='pll'", "drive.speed_filter.pole_1_rad_s=1000.0",
