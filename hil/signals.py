@@ -142,10 +142,9 @@ class Shown:
 
     ``plot``: key of a report's plot; a key that is not in :mod:`hil.report.curves` is a plot of its own.
     ``label``: what legends call it; ``place``: its order there. ``compared``: drawn where several runs are.
-    ``until_stop``: means nothing once the run stops. ``live``: its plot in ``hil watch --web``, there once a
-    curve of it has a number. ``what_if``: compared between the logged and another controller. ``line``: what
-    its line of ``hil watch`` in the terminal is called; ``span``: the smallest range that fills its height,
-    in the drawn unit.
+    ``until_stop``: means nothing once the run stops. ``live``: its plot in ``hil watch --web``.
+    ``what_if``: compared between the logged and another controller. ``line``: what its line of ``hil watch``
+    in the terminal is called; ``span``: the smallest range that fills its height, in the drawn unit.
     """
 
     plot: str = ""
@@ -248,7 +247,7 @@ FIELDS: Final[tuple[Field, ...]] = (
           absent=0),
     Field(39, "theta_ref", "f8", "rad", "input",
           "reference angle from where it was armed (position), NaN for other laws", absent=math.nan,
-          shown=Shown("angle", "θ*", live="angle")),
+          shown=Shown("angle", "θ*")),
     Field(69, "theta", "f8", "rad", "input", "measured mechanical angle, NaN where the drive reports none",
           absent=math.nan, shown=Shown("theta", "theta", compared=False)),
     Field(48, "state", "u4", "", "output", "DriveState of the supervisor",
@@ -290,10 +289,10 @@ FIELDS: Final[tuple[Field, ...]] = (
           shown=Shown("current", "i_d*", 3, False, live="current", what_if=True)),
     Field(70, "theta_turned", "f8", "rad", "output",
           "angle from where it was armed, over turns (position), NaN for other laws",
-          shown=Shown("angle", "θ", 1, live="angle")),
+          shown=Shown("angle", "θ", 1)),
     Field(71, "theta_error", "f8", "rad", "output",
           "following error of the angle, theta_ref - theta_turned (position), NaN for other laws",
-          shown=Shown("angle_error", "θ* − θ", live="angle error", line="angle error", span=0.01)),
+          shown=Shown("angle_error", "θ* − θ", line="angle error", span=0.01)),
 )  # fmt: skip
 
 

@@ -53,10 +53,10 @@ def test_a_new_field_in_a_plot_there_is_and_in_one_of_its_own() -> None:
 
 def test_the_live_page_has_every_live_field() -> None:
     named = [key for _, curves in live_plots() for key, _ in curves]
-    assert sorted(named) == sorted(field.name for field in FIELDS if field.shown.live) and len(named) == 14
+    assert sorted(named) == sorted(field.name for field in FIELDS if field.shown.live) and len(named) == 11
     assert [title for title, _ in live_plots()] == [
         "speed [rad/s]", "current [A]", "command [V, or what the drive takes]",
-        "load torque [N m]", "lateness [us]", "angle [rad]", "angle error [rad]",
+        "load torque [N m]", "lateness [us]",
     ]  # fmt: skip
     assert set(binned(new_ticks(3), 1000)) == {"t", *named}
 

@@ -26,19 +26,8 @@
     });
   }
 
-  function fit({chart, place}) {
-    if (!place.hidden) chart.setSize({width: place.clientWidth, height: HEIGHT});
-  }
-
   function draw() {
-    for (const {chart, place, keys} of plots) {
-      chart.setData([kept.t, ...keys.map(key => kept[key] ?? [])]);
-      const empty = kept.t.length > 0 && !keys.some(key => kept[key]?.some(value => value !== null)); // no angle is followed, say
-      if (place.hidden !== empty) {
-        place.hidden = empty;
-        fit({chart, place});
-      }
-    }
+    for (const {chart, keys} of plots) chart.setData([kept.t, ...keys.map(key => kept[key] ?? [])]);
     document.body.dataset.points = kept.t.length;
     document.body.dataset.last = kept.t.at(-1) ?? "";
   }
@@ -141,7 +130,7 @@
     get("stop").disabled = true;
     socket.send(JSON.stringify({stop: token}));
   };
-  addEventListener("resize", () => plots.forEach(fit));
+  addEventListener("resize", () => plots.forEach(({chart, place}) => chart.setSize({width: place.clientWidth, height: HEIGHT})));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { build(); draw(); });
   connect();
 })();
