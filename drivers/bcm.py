@@ -87,7 +87,6 @@ class KernelSync:
     ) -> None:
         self.send_id, self._steering = send_id, Steering(period_ns)
         counts = range(1, SYNC_COUNTS + 1) if counted else range(1)
-        self._count = len(counts)
         self._frames = b"".join(CLASSIC.pack(send_id, counted, bytes((count,))) for count in counts)
         self._job, self._ear = job, ear
         self._going = False
@@ -118,7 +117,7 @@ class KernelSync:
 
     def _setup(self, flags: int) -> None:
         interval = divmod(self._steering.interval_us, 1_000_000)
-        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, self._count)
+        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, len(self._frames) // CLASSIC.size)
         self._job.send(head + self._frames)
 
     def taken(self) -> tuple[int, int]:
