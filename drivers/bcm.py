@@ -116,8 +116,8 @@ class KernelSync:
         self._going = True
 
     def _setup(self, flags: int) -> None:
-        interval = divmod(self._steering.interval_us, 1_000_000)
-        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, len(self._frames) // CLASSIC.size)
+        interval, count = divmod(self._steering.interval_us, 1_000_000), len(self._frames) // CLASSIC.size
+        head = _HEAD.pack(TX_SETUP, flags, 0, 0, 0, *interval, self.send_id, count)
         self._job.send(head + self._frames)
 
     def taken(self) -> tuple[int, int]:
